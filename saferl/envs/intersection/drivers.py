@@ -1,0 +1,137 @@
+"""Scripted drivers: baselines that follow the reference line, with and without eyes for traffic."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from saferl.envs.intersection.dynamics import ACTION_SCALE, L_F, L_R
+from saferl.envs.intersection.geometry import (
+    line_pose,
+    overlap,
+    project,
+    reference_lines,
+    wrap,
+)
+
+CRUISE = 9.0  # m/s
+_LATERAL = 4.5  # m/s^2, the most that a driver asks of a bend
+_BRAKE = 3.0  # m/s^2, comfortable
+
+
+class Driver(TensorDictModuleBase):
+    """Follows the lane of its route at up to ``speed``, slower in bends; blind to traffic.
+
+    Steering is pure pursuit of a point on the reference line; speed is a proportional controller.
+
+    Args:
+        speed: m/s.
+
+    Reads ``ego`` [*B, 9] and ``route`` [*B, 1] (and ``vehicles`` [*B, M, 6] in subclasses). Writes
+    ``action`` [*B, 2] in [-1, 1].
+
+    >>> from saferl.envs.intersection import BatchedIntersection, Scenario
+    >>> env = BatchedIntersection(Scenario(task="lt", vehicles=0), num_envs=4)
+    >>> bool(env.rollout(125, Driver())["next", "success"][:, -1].all())
+    True
+    """
+
+    in_keys = ["ego", "vehicles", "route"]
+    out_keys = ["action"]
+
+    def __init__(self, speed: float = CRUISE):
+        super().__init__()
+        self.speed = speed
+
+    def target_speed(self, ego: Tensor, vehicles: Tensor, line: Tensor, s: Tensor) -> Tensor:
+        """Speed to aim for [*B], m/s, at arc length ``s`` [*B] of ``line`` [*B, 4, 6]."""
+        return self.bend_speed(line, s)
+
+    def bend_speed(self, line: Tensor, s: Tensor) -> Tensor:
+        """``speed``, or what the sharpest bend of the next 12 m allows."""
+        start, length, curvature = line[..., 5], line[..., 4], line[..., 3].abs()
+        near = (start < s[..., None] + 12.0) & (start + length > s[..., None])
+        limit = torch.sqrt(_LATERAL / curvature.clamp_min(1e-3))
+        return torch.where(near, limit, self.speed).amin(-1).clamp_max(self.speed)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        ego, route = tensordict["ego"], tensordict["route"].squeeze(-1)
+        line = reference_lines(route, ego)[..., 0, :, :]
+        _, s, _ = project(ego[..., 1:3], line)
+        v = ego[..., 3]
+        target = self.target_speed(ego, tensordict["vehicles"], line, s)
+        aim = line_pose(line, s + 2.0 + 0.5 * v)
+        dx, dy = aim[..., 0] - ego[..., 1], aim[..., 1] - ego[..., 2]
+        bearing = wrap(torch.atan2(dy, dx) - ego[..., 5])
+        curvature = 2 * torch.sin(bearing) / torch.hypot(dx, dy).clamp_min(1.0)
+        action = torch.stack(
+            [1.5 * (target - v) / ACTION_SCALE[0], (L_F + L_R) * curvature / ACTION_SCALE[1]], -1
+        )
+        return tensordict.set("action", action.clamp(-1.0, 1.0))
+
+
+class CautiousDriver(Driver):
+    """Follows its lane and waits before the box until its way through is predicted to be free.
+
+    Every choice of speed is played forward along the line for 4 s against the observed vehicles at
+    constant velocity, all rectangles enlarged; the fastest choice that hits nobody is taken, and the
+    hardest braking if every one does.
+
+    Args:
+        speed: m/s, of the free road.
+        margin: enlargement of the predicted rectangles.
+    """
+
+    choices = (1.0, 0.66, 0.33, 0.0)  # of the free speed
+
+    def __init__(self, speed: float = CRUISE, margin: float = 1.5):
+        super().__init__(speed)
+        self.margin = margin
+
+    def target_speed(self, ego: Tensor, vehicles: Tensor, line: Tensor, s: Tensor) -> Tensor:
+        free = self.bend_speed(line, s)
+        times = torch.arange(1, 17, dtype=ego.dtype, device=ego.device) * 0.25
+        choice = free[..., None] * ego.new_tensor(self.choices)
+        v = ego[..., 3, None, None]
+        # Speed moves to the choice at a fixed rate: closed form of the distance covered.
+        rate = torch.where(choice[..., None] < v, -1.5 * _BRAKE, _BRAKE)
+        reach = ((choice[..., None] - v) / rate).clamp_min(0.0)
+        within = torch.minimum(times, reach)
+        ahead = v * within + rate * within.square() / 2 + choice[..., None] * (times - within)
+        pose = line_pose(line[..., None, None, :, :].expand(*ahead.shape, 4, 6), s[..., None, None] + ahead)
+        world = _world_velocity(ego)
+        speed = vehicles[..., 3:5] + world[..., None, :]
+        start = vehicles[..., 1:3] + ego[..., None, 1:3]
+        moved = start[..., None, :] + speed[..., None, :] * times[:, None]  # [*B, M, T, 2]
+        heading = vehicles[..., None, 5:6].expand(*moved.shape[:-1], 1)
+        other = torch.cat([moved, heading], -1).transpose(-3, -2)[..., None, :, :, :]  # [*B, 1, T, M, 3]
+        hit = overlap(pose[..., None, :], other, scale=self.margin)
+        hit &= vehicles[..., None, None, :, 0] > 0.5
+        free_choice = ~hit.flatten(-2).any(-1)
+        return torch.where(free_choice, choice, 0.0).amax(-1)
+
+
+def _world_velocity(ego: Tensor) -> Tensor:
+    cos, sin = torch.cos(ego[..., 5]), torch.sin(ego[..., 5])
+    return torch.stack([ego[..., 3] * cos - ego[..., 4] * sin, ego[..., 3] * sin + ego[..., 4] * cos], -1)
+
+
+class RandomDriver(Driver):
+    """Uniform random actions, the floor of every table; a generator of its own.
+
+    Args:
+        seed: of the generator.
+    """
+
+    def __init__(self, seed: int = 0):
+        super().__init__()
+        self.seed, self._generator = seed, None
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        ego = tensordict["ego"]
+        if self._generator is None:
+            self._generator = torch.Generator(ego.device).manual_seed(self.seed)
+        action = torch.rand((*ego.shape[:-1], 2), generator=self._generator, device=ego.device)
+        return tensordict.set("action", 2 * action - 1)

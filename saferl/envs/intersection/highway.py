@@ -1,0 +1,224 @@
+"""The intersection as a gymnasium environment on highway-env's road and vehicles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+
+from saferl.envs.intersection.base import SUBSTEPS, Scenario
+from saferl.envs.intersection.batched import draw_route, draw_start
+from saferl.envs.intersection.cost import CollisionCost
+from saferl.envs.intersection.dynamics import to_physical
+from saferl.envs.intersection.geometry import ROUTES, ROUTES_OF_TASK, TASK_OF_ROUTE, TASKS
+from saferl.envs.intersection.geometry import arrived, offroad
+from saferl.envs.intersection.network import rectangles_overlap
+from saferl.envs.intersection.observation import ROWS, observe
+from saferl.envs.intersection.regulation import IntersectionRoad
+from saferl.envs.intersection.rendering import Renderer
+from saferl.envs.intersection.reward import Reward
+from saferl.envs.intersection.traffic import EgoVehicle, draw_traffic
+
+
+def _build(name: str, kind: type, value: Any) -> Any:
+    if isinstance(value, kind):
+        return value
+    if not isinstance(value, Mapping | None):
+        raise ValueError(f"{name} must be a {kind.__name__} or a mapping, got {value!r}.")
+    settings = dict(value or {})
+    known = list(kind.__dataclass_fields__)
+    for key in settings:
+        if key not in known:
+            raise ValueError(f"{name}.{key} is unknown; choose from {', '.join(known)}.")
+    return kind(**settings)
+
+
+class IntersectionEnv(gymnasium.Env):
+    """Drive the ego through an unsignalised intersection with up to ten other vehicles.
+
+    The observation is a dict of ``ego`` [9] and ``vehicles`` [rows, 6] (:func:`observe`, SI units),
+    the action [2] in [-1, 1] is (a_x / 5 m/s^2, delta_f / 0.6 rad). ``info`` holds ``cost``
+    (Algorithm 2 on the state before the step and the executed action; 0.0 at reset), the outcomes
+    ``collision``, ``offroad``, ``success``, and ``route`` and ``task``.
+
+    All randomness comes from ``np_random``: the same seed and actions give the same episode, bit
+    for bit. ``reset`` takes ``options``: ``task`` (one episode on another task), ``route`` (a name
+    in :data:`ROUTES`) and ``start`` (the ego's state [6]).
+
+    Args:
+        task, vehicles, rows, policy_frequency, duration, route_starts: see :class:`Scenario`.
+        reward: a :class:`Reward` or its fields, e.g. ``{"reading": "raw", "risk_shaping": True}``.
+        cost: a :class:`CollisionCost` or its fields.
+        render_mode: None or ``rgb_array``.
+
+    >>> env = IntersectionEnv(task="lt")
+    >>> observation, info = env.reset(seed=0)
+    >>> observation["vehicles"].shape, info["success"]
+    ((11, 6), False)
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 5}
+
+    def __init__(
+        self,
+        task: str = "mixed",
+        vehicles: int = 10,
+        rows: int = ROWS,
+        policy_frequency: int = 5,
+        duration: float = 25.0,
+        route_starts: float = 0.0,
+        reward: Reward | Mapping[str, Any] | None = None,
+        cost: CollisionCost | Mapping[str, Any] | None = None,
+        render_mode: str | None = None,
+    ):
+        self.scenario = Scenario(
+            task=task, vehicles=vehicles, rows=rows, policy_frequency=policy_frequency,
+            duration=duration, route_starts=route_starts, reward=_build("reward", Reward, reward),
+            cost=_build("cost", CollisionCost, cost),
+        )  # fmt: skip
+        modes = self.metadata["render_modes"]
+        if render_mode is not None and render_mode not in modes:
+            raise ValueError(
+                f"render_mode must be None or one of {', '.join(modes)}, got {render_mode!r}."
+            )
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": policy_frequency}
+        unbounded = {"low": -np.inf, "high": np.inf, "dtype": np.float32}
+        self.observation_space = spaces.Dict(
+            {
+                "ego": spaces.Box(shape=(9,), **unbounded),
+                "vehicles": spaces.Box(shape=(rows, 6), **unbounded),
+            }
+        )
+        self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self.road: IntersectionRoad | None = None
+        self._renderer: Renderer | None = None
+
+    @property
+    def ego(self) -> EgoVehicle:
+        """The ego vehicle of the running episode."""
+        if self.road is None or self.road.ego is None:
+            raise gymnasium.error.ResetNeeded("reset the environment first.")
+        return self.road.ego
+
+    def snapshot(self) -> tuple[np.ndarray, np.ndarray]:
+        """States of the ego [6] and of the surrounding vehicles [N, 6], float64, for plots."""
+        return self.ego.state.numpy().copy(), self.road.states()
+
+    def _choose_route(self, options: Mapping[str, Any], seed: torch.Tensor) -> torch.Tensor:
+        if (name := options.get("route")) is not None:
+            if name not in ROUTES:
+                raise ValueError(f"options.route must be one of {', '.join(ROUTES)}, got {name!r}.")
+            return torch.tensor(ROUTES.index(name))
+        task = options.get("task", self.scenario.task)
+        if task not in ROUTES_OF_TASK:
+            raise ValueError(
+                f"options.task must be one of {', '.join(ROUTES_OF_TASK)}, got {task!r}."
+            )
+        return draw_route(task, seed)
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Draw a scene; ``options`` may hold ``task``, ``route`` and ``start``."""
+        super().reset(seed=seed)
+        options = options or {}
+        unknown = set(options) - {"task", "route", "start"}
+        if unknown:
+            raise ValueError(f"options must be among task, route, start, got {sorted(unknown)}.")
+        draw = torch.tensor(int(self.np_random.integers(2**31)))
+        self._route = self._choose_route(options, draw)
+        start = options.get("start")
+        if start is None:
+            start = draw_start(self._route, draw, self.scenario.route_starts)
+        start = torch.as_tensor(start, dtype=torch.float64)
+        if start.shape != (6,):
+            raise ValueError(f"options.start must have shape (6,), got {tuple(start.shape)}.")
+        if self.road is None:
+            self.road = IntersectionRoad(self.np_random)
+        self.road.np_random = self.np_random
+        ego = EgoVehicle(self.road, start, int(self._route))
+        traffic = draw_traffic(self.np_random, self.road.table, self.scenario.vehicles, ego)
+        self.road.populate(ego, *traffic)
+        self._steps, self._control = 0, None
+        return self._observe(), self._info(0.0, False, False, False)
+
+    def _observe(self) -> dict[str, np.ndarray]:
+        self._vehicles = torch.from_numpy(self.road.states())
+        present = torch.ones(len(self._vehicles), dtype=torch.bool)
+        self._own, table, self._observed = observe(
+            self.ego.state, self._vehicles, present, self._route, self.scenario.rows
+        )
+        return {"ego": self._own.float().numpy(), "vehicles": table.float().numpy()}
+
+    def _info(self, cost: float, collision: bool, off: bool, success: bool) -> dict[str, Any]:
+        route = int(self._route)
+        return {
+            "cost": cost,
+            "collision": collision,
+            "offroad": off,
+            "success": success,
+            "route": ROUTES[route],
+            "task": TASKS[TASK_OF_ROUTE[route]],
+        }
+
+    def _collides(self) -> bool:
+        ego = self.ego
+        pose = np.array([*ego.position, ego.heading])
+        return bool(rectangles_overlap(pose, self.road.pose).any())
+
+    def step(
+        self, action: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Hold ``action`` [2] for one decision (three substeps; a collision ends it at once)."""
+        ego, scenario = self.ego, self.scenario
+        control = to_physical(torch.as_tensor(np.asarray(action), dtype=torch.float64))
+        previous = control if self._control is None else self._control
+        cost = float(scenario.cost(ego.state, control, self._vehicles, self._observed))
+        ego.act(control)
+        collision = False
+        for _ in range(SUBSTEPS):
+            self.road.act()
+            self.road.step(scenario.dt)
+            collision = self._collides()
+            if collision:
+                break
+        self._control, self._steps = control, self._steps + 1
+        observation = self._observe()
+        off = bool(offroad(ego.state))
+        success = not (collision or off) and bool(arrived(ego.state, self._route))
+        reward = scenario.reward(
+            ego.state, self._route, control, previous, self._own[7], self._own[8],
+            self._observed.any(), torch.tensor(collision or off), torch.tensor(success),
+        )  # fmt: skip
+        terminated = collision or off or success
+        truncated = self._steps >= scenario.horizon
+        info = self._info(cost, collision, off, success)
+        return observation, float(reward), terminated, truncated, info
+
+    def render(self) -> np.ndarray | None:
+        """The scene [600, 600, 3] uint8 with ``render_mode="rgb_array"``, else None."""
+        if self.render_mode is None:
+            return None
+        if self._renderer is None:
+            self._renderer = Renderer()
+        _ = self.ego
+        return self._renderer.draw(self.road)
+
+    def close(self) -> None:
+        """Let go of the drawing surface."""
+        self._renderer = None
+
+
+def register() -> None:
+    """Make ``saferl/Intersection-{LT,GS,RT,Mixed}-v0`` known to ``gymnasium.make``."""
+    for name, task in (("LT", "lt"), ("GS", "gs"), ("RT", "rt"), ("Mixed", "mixed")):
+        gymnasium.register(
+            id=f"saferl/Intersection-{name}-v0",
+            entry_point="saferl.envs.intersection.highway:IntersectionEnv",
+            kwargs={"task": task},
+        )

@@ -1,0 +1,262 @@
+"""The regulated road: improved IDM traffic that yields, clears the box and never locks up.
+
+highway-env's road predicts the ego again for every pair of vehicles, tests rectangles with a
+rotation of the wrong sign, and stops yielding vehicles wherever they are. Here every vehicle is
+predicted once, all pairs are tested at once by the separating axis theorem, and a yielding vehicle
+stops before the box.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from highway_env.road.regulation import RegulatedRoad
+
+from saferl.envs.intersection.geometry import ARM, LENGTH, TASK_OF_ROUTE, WIDTH
+from saferl.envs.intersection.network import build_network, rectangles_overlap, routes
+from saferl.envs.intersection.traffic import EgoVehicle, RouteVehicle
+
+PERIOD = 0.2  # s between two decisions of the traffic, at any policy frequency
+HORIZON = 2.0  # s of prediction (paper)
+TIMES = np.arange(0.25, HORIZON + 0.01, 0.25)
+STRETCH = 1.5  # predicted rectangles are 1.5 times as long, as in highway-env
+GO_SPEED = 4.0  # m/s, least speed at which a vehicle predicts its own crossing
+COMMIT = 5.0  # m/s^2; a vehicle that could not stop with it before the box has entered
+STOP = ARM - LENGTH / 2 - 1.0  # m, where a yielding vehicle's centre stops
+TIME_MARGIN = 0.5  # s between two vehicles in the zone where their routes cross
+CORRIDOR = WIDTH / 2 + 0.3  # m to either side of the route that must be free of bodies
+BODY_GAP = 2.0  # m kept from a body across the corridor
+_BODY = np.array([(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.5)]) * (LENGTH, WIDTH)
+
+
+class IntersectionRoad(RegulatedRoad):
+    """highway-env's regulated road with the ego and surrounding vehicles on routes.
+
+    The rules, each pass (every 0.2 s):
+
+    1. A vehicle has *entered* once its front is past the entry line or it can no longer stop before
+       it. Entered vehicles never yield to vehicles that have not, so the box clears.
+    2. Of the vehicles that have not entered only the first on each lane decides. It waits at the
+       line while an entered vehicle on a crossing route would meet it in the zone that both sweep,
+       and while the predicted rectangles (2 s at constant speed) meet those of a vehicle of higher
+       rank that does not wait itself.
+    3. Rank: entered vehicles in order of entry, then road priority, then time to the line. It is a
+       total order, so no two vehicles ever wait for each other.
+    4. Two entered vehicles bound for the same zone: the later one brakes before it.
+    5. The ego counts as a vehicle of its rank, predicted along its route at constant speed; any
+       body in a vehicle's corridor ahead is a leader, whatever lane it is on.
+
+    Attributes:
+        ego: the ego vehicle, or None.
+        traffic: the surrounding vehicles.
+        route, s, speed, desired: their routes [N], arc lengths [N] m, speeds and wanted speeds
+            [N] m/s.
+        held: [N] bool, waits at the entry line; stop: [N] arc length where it must stop, or inf.
+    """
+
+    def __init__(self, np_random: np.random.Generator | None = None, network=None):
+        super().__init__(network or build_network(), [], [], np_random or np.random.default_rng())
+        self.table = routes()
+        self.populate(None, np.zeros(0, int), np.zeros(0), np.zeros(0))
+
+    def populate(
+        self, ego: EgoVehicle | None, route: np.ndarray, s: np.ndarray, speed: np.ndarray
+    ) -> None:
+        """Put the ego and new surrounding vehicles on the road, and start its clock."""
+        self.ego = ego
+        self.traffic = [
+            RouteVehicle(self, r, at, v, self.table)
+            for r, at, v in zip(route, s, speed, strict=True)
+        ]
+        self.vehicles = ([ego] if ego is not None else []) + self.traffic
+        self.route, self.s = np.array(route, int), np.array(s, float)
+        self.speed, self.desired = np.array(speed, float), np.array(speed, float)
+        self.acceleration = np.zeros(len(route))
+        self.entered = np.full(len(route) + 1, np.inf)  # s, the ego last
+        self.held = np.zeros(len(route), bool)
+        self.stop = np.full(len(route), np.inf)
+        self.pose = self.table.pose(self.route, self.s)
+        self.time, self.next_pass = 0.0, 0.0
+
+    def states(self) -> np.ndarray:
+        """States [N, 6] of the surrounding vehicles: x, y, v_x, 0, phi, omega."""
+        out = np.zeros((len(self.s), 6))
+        out[:, :2], out[:, 4] = self.pose[:, :2], self.pose[:, 2]
+        out[:, 2] = self.speed
+        out[:, 5] = self.speed * self.table.bend(self.route, self.s)
+        return out
+
+    def _ego_on_route(self) -> tuple[int, float, float, float]:
+        """The ego's route among the 16, arc length, lateral offset and speed along the route."""
+        ego = self.ego
+        s, lateral = self.table.project(ego.route_id, ego.position[None])
+        heading = self.table.pose(ego.route_id, s)[0, 2]
+        return ego.route_id, s[0], lateral[0], max(ego.speed * np.cos(ego.heading - heading), 0.0)
+
+    def enforce_road_rules(self) -> None:
+        """Decide which vehicles wait at the line or brake in the box; writes ``held``, ``stop``."""
+        table, count = self.table, len(self.s)
+        route, s, speed = self.route, self.s, self.speed
+        if self.ego is not None:
+            e_route, e_s, e_lateral, e_speed = self._ego_on_route()
+            route, s, speed = np.append(route, e_route), np.append(s, e_s), np.append(speed, e_speed)
+            held = np.append(self.held, False)
+        else:
+            held = self.held
+        total = len(s)
+        to_line = ARM - LENGTH / 2 - s
+        present = s < table.out[route] + LENGTH / 2  # not yet out of the box
+        unable = ~held & (speed**2 > 2 * COMMIT * (to_line - 0.5))
+        inside = present & ((to_line < 0) | unable)
+        entered = np.where(inside, np.minimum(self.entered[:total], self.time), np.inf)
+        self.entered[:total] = entered
+        if self.ego is None:
+            self.entered[-1] = np.inf
+
+        arrival = np.minimum(np.maximum(to_line, 0) / np.maximum(speed, 1.0), 900.0)
+        rank = table.priority[route] * 1e3 - arrival
+        rank = np.where(inside, 1e6 - np.where(inside, entered, 0.0), rank)
+        rank = rank + s * 1e-6 - np.arange(total) * 1e-9
+
+        # The first vehicle on each approach lane that has not entered.
+        waiting = present & ~inside
+        same = table.approach[route][:, None] == table.approach[route]
+        head = waiting & ~(same & waiting & (s > s[:, None])).any(1)
+
+        go = np.maximum(speed, GO_SPEED)
+        if self.ego is not None:
+            go[-1] = speed[-1]
+        path = table.pose(route[:, None], s[:, None] + go[:, None] * TIMES)  # [total, T, 3]
+        if self.ego is not None:
+            path[-1, :, 0] -= e_lateral * np.sin(path[-1, :, 2])
+            path[-1, :, 1] += e_lateral * np.cos(path[-1, :, 2])
+            path[-1, :, 2] += self.ego.heading - table.pose(e_route, np.float64(e_s))[2]
+        meet = rectangles_overlap(path[:, None], path, STRETCH * LENGTH, WIDTH).any(-1) & ~same
+
+        clash = self._clashes(route, s, speed, go)
+        blocked = (clash & inside[:count]).any(1) if count else np.zeros(0, bool)
+        free = np.zeros(total, bool)
+        if self.ego is not None:
+            free[-1] = present[-1]
+        new_held = np.zeros(count, bool)
+        for i in np.argsort(-rank):
+            if i < count and head[i]:
+                new_held[i] = blocked[i] or (meet[i] & free & (rank > rank[i])).any()
+                free[i] = not new_held[i]
+        self.held = new_held
+        self.stop = np.where(new_held, STOP, self._stops_in_box(route, s, rank, inside, clash))
+        for vehicle, yields in zip(self.traffic, self.held, strict=True):
+            vehicle.is_yielding = bool(yields)
+
+    def _clashes(self, route, s, speed, go) -> np.ndarray:
+        """[N, N]: would vehicles i and j be in the zone of their routes at the same time?"""
+        count = len(self.s)
+        route, s, speed, go = route[:count], s[:count], speed[:count], go[:count]
+        mine = self.table.zone[route[:, None], route]
+        other = mine.transpose(1, 0, 2)
+        crossing = np.isfinite(mine[..., 0]) & (s[:, None] < mine[..., 1]) & (s < other[..., 1])
+        with np.errstate(invalid="ignore"):
+            begin = (mine[..., 0] - s[:, None]) / go[:, None]
+            end = (mine[..., 1] - s[:, None]) / go[:, None]
+            pace = np.maximum(speed, 0.5)
+            other_begin = np.maximum(other[..., 0] - s, 0.0) / pace
+            other_end = (other[..., 1] - s) / pace
+        return crossing & (begin < other_end + TIME_MARGIN) & (other_begin < end + TIME_MARGIN)
+
+    def _stops_in_box(self, route, s, rank, inside, clash) -> np.ndarray:
+        """[N] arc length before which a vehicle that has entered must stop for an earlier one."""
+        count = len(self.s)
+        if not count:
+            return np.zeros(0)
+        route, s, rank, inside = route[:count], s[:count], rank[:count], inside[:count]
+        begin = self.table.zone[route[:, None], route][..., 0]
+        within = s[:, None] >= begin
+        behind = ~within & (within.T | (rank > rank[:, None]))
+        wait = clash & behind & inside & inside[:, None]
+        return np.where(wait, begin - 0.5, np.inf).min(1)
+
+    def act(self) -> None:
+        """Accelerations of all surrounding vehicles: IDM behind leaders, braking before stops.
+
+        Applies the road rules first if a pass is due.
+        """
+        if self.time >= self.next_pass - 1e-9:
+            self.enforce_road_rules()
+            self.next_pass += PERIOD
+        count = len(self.s)
+        if not count:
+            return
+        table, s, v, route = self.table, self.s, self.speed, self.route
+        top, best = RouteVehicle.COMFORT_ACC_MAX, -RouteVehicle.COMFORT_ACC_MIN
+        # Slow down in time for the box, keep its speed limit, and speed up after it.
+        limit = np.sqrt(table.turn_speed[route] ** 2 + 2 * 2.0 * np.maximum(ARM - s, 0.0))
+        limit = np.where(s > table.out[route], np.inf, limit)
+        wanted = np.minimum(self.desired, limit)
+        a = top * (1 - (v / wanted) ** RouteVehicle.DELTA)
+
+        gap, pace, along = self._leaders()
+        gap = np.maximum(gap, 0.1)
+        spacing = (
+            RouteVehicle.DISTANCE_WANTED
+            - LENGTH
+            + v[:, None] * RouteVehicle.TIME_WANTED
+            + v[:, None] * (v[:, None] - pace) / (2 * np.sqrt(top * best))
+        )
+        follow = a[:, None] - top * (np.maximum(spacing, 0.5) / gap) ** 2
+        # A body across the corridor is no leader to follow; brake for it once that is needed.
+        need = v[:, None] ** 2 / (2 * np.maximum(gap - BODY_GAP, 0.1))
+        cross = np.where((need > 3.0) | (gap < BODY_GAP + 0.5), -np.maximum(need, 1.0), np.inf)
+        a = np.minimum(a, np.where(along, follow, cross).min(1, initial=np.inf))
+
+        room = self.stop - s
+        need = v**2 / (2 * np.maximum(room, 0.1))
+        brake = (need > 2.0) | (room < 1.0)
+        a = np.where(brake & (room > -1.0), np.minimum(a, -np.maximum(need, 0.5)), a)
+        self.acceleration = np.clip(a, -RouteVehicle.ACC_MAX, RouteVehicle.ACC_MAX)
+
+    def _leaders(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """For N vehicles and M bodies: gap [N, M] m (inf if not ahead), the body's speed along the
+        route [N, M], and whether it drives along it."""
+        pose, speed = self.pose, self.speed
+        if self.ego is not None:
+            ego = self.ego
+            pose = np.concatenate([pose, [[*ego.position, ego.heading]]])
+            speed = np.append(speed, ego.speed)
+        cos, sin = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
+        points = np.stack(
+            [pose[:, 0, None] + cos * _BODY[:, 0] - sin * _BODY[:, 1],
+             pose[:, 1, None] + sin * _BODY[:, 0] + cos * _BODY[:, 1]], -1,
+        )  # fmt: skip
+        where, lateral = self.table.project(
+            self.route[:, None], np.broadcast_to(points, (len(self.s), *points.shape))
+        )
+        ahead = (np.abs(lateral) < CORRIDOR) & (where > self.s[:, None, None] + 1.0)
+        gap = np.where(ahead, where, np.inf).min(-1) - self.s[:, None] - LENGTH / 2
+        index = np.arange(len(self.s))
+        gap[index, index] = np.inf
+        near = np.where(np.isfinite(gap), gap + LENGTH / 2, 0.0) + self.s[:, None]
+        heading = self.table.pose(self.route[:, None], near)[..., 2]
+        aligned = np.cos(pose[:, 2] - heading)
+        return gap, speed * aligned, aligned > 0.5
+
+    def step(self, dt: float) -> None:
+        """Move every vehicle by ``dt`` seconds; who passes the end of an exit arm is removed."""
+        if self.ego is not None:
+            self.ego.step(dt)
+        speed = np.maximum(self.speed + self.acceleration * dt, 0.0)
+        self.s = self.s + (self.speed + speed) / 2 * dt
+        self.speed = speed
+        self.time += dt
+        self.pose = self.table.pose(self.route, self.s)
+        for k, vehicle in enumerate(self.traffic):
+            vehicle.follow(self.s[k], self.speed[k], self.acceleration[k], self.pose[k])
+        gone = self.s + LENGTH / 2 > self.table.out[self.route] + ARM
+        if gone.any():
+            self._remove(gone)
+
+    def _remove(self, gone: np.ndarray) -> None:
+        keep = ~gone
+        self.traffic = [v for v, kept in zip(self.traffic, keep, strict=True) if kept]
+        self.vehicles = ([self.ego] if self.ego is not None else []) + self.traffic
+        for name in ("route", "s", "speed", "desired", "acceleration", "held", "stop", "pose"):
+            setattr(self, name, getattr(self, name)[keep])
+        self.entered = np.append(self.entered[:-1][keep], self.entered[-1])

@@ -1,0 +1,76 @@
+"""Pictures of a scene, drawn with highway-env's own graphics and without a display."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from saferl.envs.intersection.regulation import IntersectionRoad
+
+SIZE = 600  # pixels
+VIEW = 55.0  # m shown to either side of the middle of the intersection
+_GRASS = (122, 158, 108)
+_ASPHALT = (100, 100, 100)
+
+
+class Renderer:
+    """Draws a road into arrays [600, 600, 3] uint8, north up, the whole intersection in view.
+
+    Args:
+        size: width and height in pixels.
+        view: metres shown to either side of the middle.
+    """
+
+    def __init__(self, size: int = SIZE, view: float = VIEW):
+        # pygame asks SDL for a video driver as soon as graphics are imported and used.
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+        import pygame
+        from highway_env.road.graphics import WorldSurface
+
+        self.surface = WorldSurface((size, size), 0, pygame.Surface((size, size)))
+        self.surface.scaling = size / (2 * view)
+        self.surface.centering_position = [0.5, 0.5]
+        self.surface.move_display_window_to(np.zeros(2))
+        self._background = None
+
+    def _draw_background(self, road: IntersectionRoad) -> None:
+        import pygame
+        from highway_env.road.graphics import LaneGraphics
+
+        from saferl.envs.intersection.geometry import CURB_RADIUS, HALF_BOX, LANE_WIDTH
+
+        surface, half = self.surface, 2 * LANE_WIDTH
+        surface.fill(_GRASS)
+        pix = surface.vec2pix
+        far = 2 * VIEW
+        for (x, y), (w, h) in (
+            ((-half, -far), (2 * half, 2 * far)),
+            ((-far, -half), (2 * far, 2 * half)),
+            ((-HALF_BOX, -HALF_BOX), (2 * HALF_BOX, 2 * HALF_BOX)),
+        ):
+            (left, top), (right, bottom) = pix((x, y)), pix((x + w, y + h))
+            pygame.draw.rect(surface, _ASPHALT, (left, top, right - left, bottom - top))
+        for x in (-HALF_BOX, HALF_BOX):
+            for y in (-HALF_BOX, HALF_BOX):
+                pygame.draw.circle(surface, _GRASS, pix((x, y)), surface.pix(CURB_RADIUS))
+        for lane in road.network.lanes_list():
+            LaneGraphics.display(lane, surface)
+        self._background = surface.copy()
+
+    def draw(self, road: IntersectionRoad) -> np.ndarray:
+        """The scene as it is now; yielding vehicles are orange, the ego is green."""
+        import pygame
+        from highway_env.vehicle.graphics import VehicleGraphics
+
+        if self._background is None:
+            self._draw_background(road)
+        self.surface.blit(self._background, (0, 0))
+        for vehicle in road.vehicles:
+            VehicleGraphics.display(vehicle, self.surface, offscreen=True)
+        return np.ascontiguousarray(
+            np.moveaxis(pygame.surfarray.array3d(self.surface), 0, 1)
+        )  # fmt: skip

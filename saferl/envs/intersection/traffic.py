@@ -1,0 +1,146 @@
+"""The vehicles on the road: the ego, the surrounding vehicles, and how these are drawn."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from highway_env.road.road import Road
+from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.kinematics import Vehicle
+from torch import Tensor
+
+from saferl.envs.intersection.dynamics import step_ego
+from saferl.envs.intersection.geometry import ARM, LENGTH, ROUTES, WIDTH
+from saferl.envs.intersection.network import Routes
+
+SPEEDS = (6.0, 10.0)  # m/s, drawn at reset
+SPAWN_LENGTH = 95.0  # m along the approach
+GAP = 15.0  # m between surrounding vehicles at reset (paper)
+EGO_GAP = 20.0  # m to the ego at reset (ours)
+
+#: Weight of each route when a surrounding vehicle is drawn, [ego's route][arm][left, straight
+#: inner, straight outer, right], arms from the ego's one clockwise (ours). The more a route crosses
+#: or joins the ego's, the likelier it is; every route keeps a positive weight.
+_WEIGHTS = {
+    "lt": [[1, 1, 1, 1], [2, 3, 3, 1], [1, 3, 3, 1], [2, 2, 2, 1]],
+    "gs_inner": [[1, 1, 1, 1], [2, 2, 2, 1], [2, 1, 1, 1], [2, 2, 2, 1]],
+    "gs_outer": [[1, 1, 1, 1], [2, 2, 2, 1], [2, 1, 1, 1], [2, 2, 2, 1]],
+    "rt": [[1, 1, 1, 1], [1, 2, 8, 1], [1, 1, 1, 1], [1, 1, 1, 1]],
+}
+ROUTE_WEIGHTS = np.array([_WEIGHTS[name] for name in ROUTES], dtype=np.float64).reshape(-1, 16)
+
+
+class RouteVehicle(IDMVehicle):
+    """A surrounding vehicle: highway-env's IDM vehicle on a route, without lane changes.
+
+    :class:`~saferl.envs.intersection.regulation.IntersectionRoad` decides and moves all of them at
+    once, exactly along their routes, so ``act`` and ``step`` of a single one do nothing.
+
+    Args:
+        road: the road it drives on.
+        route_id: its row in :class:`~saferl.envs.intersection.network.Routes`.
+        s: arc length of its centre along the route, m.
+        speed: m/s; also the speed that it wants.
+    """
+
+    LENGTH, WIDTH = LENGTH, WIDTH
+    COMFORT_ACC_MAX = 3.0  # m/s^2
+    COMFORT_ACC_MIN = -5.0
+    ACC_MAX = 6.0
+    DISTANCE_WANTED = 2.0 + LENGTH  # m, centre to centre
+    TIME_WANTED = 1.2  # s
+    YIELDING_COLOR = (255, 170, 60)
+
+    def __init__(self, road: Road, route_id: int, s: float, speed: float, table: Routes):
+        # Without a road the base class does not search every lane for the closest one.
+        super().__init__(None, [0.0, 0.0], speed=speed, enable_lane_change=False, timer=0.0)
+        self.road, self.table, self.route_id = road, table, int(route_id)
+        self.route = list(table.lanes[route_id])
+        self.desired_speed = float(speed)
+        self.is_yielding = False
+        self.lane_index = None
+        self.follow(s, speed, 0.0, table.pose(route_id, np.float64(s)))
+
+    def follow(self, s: float, speed: float, acceleration: float, pose: np.ndarray) -> None:
+        """Take the place at arc length ``s`` with ``pose`` [3]; keeps lane and route up to date."""
+        self.s, self.speed = float(s), float(speed)
+        self.position = pose[:2]
+        self.heading = float(pose[2])
+        self.action = {"steering": 0.0, "acceleration": float(acceleration)}
+        segment = 0 if s <= ARM else 1 if s <= self.table.out[self.route_id] else 2
+        index = self.table.lanes[self.route_id][segment]
+        if index != self.lane_index:
+            self.lane_index = self.target_lane_index = index
+            self.lane = self.road.network.get_lane(index)
+            self.route = list(self.table.lanes[self.route_id][segment:])
+
+    def act(self, action=None) -> None:
+        """Nothing: the road decides for all vehicles at once."""
+
+    def step(self, dt: float) -> None:
+        """Nothing: the road moves all vehicles at once."""
+
+    def predict_trajectory_constant_speed(self, times) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [T, 2] and headings [T] along the route at constant speed."""
+        pose = self.table.pose(self.route_id, self.s + self.speed * np.asarray(times))
+        return pose[:, :2], pose[:, 2]
+
+
+class EgoVehicle(Vehicle):
+    """The ego: a highway-env vehicle that moves by the dynamic bicycle (E5_1b).
+
+    Attributes:
+        state: [6] float64, x, y, v_x, v_y, phi, omega; ``position``, ``heading`` and ``speed``
+            follow it.
+        control: [2] float64, a_x (m/s^2) and delta_f (rad), held over the substeps.
+        route: row in :data:`~saferl.envs.intersection.geometry.ROUTES`.
+    """
+
+    LENGTH, WIDTH = LENGTH, WIDTH
+    COLOR = (50, 200, 0)
+
+    def __init__(self, road: Road, state: Tensor, route: int):
+        super().__init__(None, [0.0, 0.0])
+        self.road, self.route_id = road, int(route)
+        self.color = self.COLOR
+        self.control = torch.zeros(2, dtype=torch.float64)
+        self.place(state)
+
+    def place(self, state: Tensor) -> None:
+        """Take ``state`` [6]."""
+        self.state = state.to(torch.float64)
+        x, y, v_x, v_y, phi, self.omega = self.state.tolist()
+        self.position = np.array([x, y])
+        self.heading, self.speed = phi, float(np.hypot(v_x, v_y))
+
+    def act(self, action: Tensor | None = None) -> None:
+        """Hold a control [2] in physical units; without one keep the last."""
+        if action is not None:
+            self.control = action.to(torch.float64)
+            acceleration, steering = self.control.tolist()
+            self.action = {"acceleration": acceleration, "steering": steering}
+
+    def step(self, dt: float) -> None:
+        """Integrate E5_1b for ``dt`` seconds."""
+        self.place(step_ego(self.state, self.control, dt))
+
+
+def draw_traffic(
+    rng: np.random.Generator, table: Routes, count: int, ego: EgoVehicle
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Draw surrounding vehicles: route [N] int, arc length [N] m, speed [N] m/s, N <= ``count``.
+
+    ``count`` vehicles are drawn; one closer than 15 m to an earlier one (paper) or 20 m to the ego
+    (ours) is removed.
+    """
+    weight = ROUTE_WEIGHTS[ego.route_id]
+    route = rng.choice(16, size=count, p=weight / weight.sum())
+    s = rng.uniform(0.0, SPAWN_LENGTH, size=count)
+    speed = rng.uniform(*SPEEDS, size=count)
+    position = table.pose(route, s)[:, :2]
+    keep: list[int] = []
+    for k in range(count):
+        near = np.hypot(*(position[keep] - position[k]).T) < GAP
+        if np.hypot(*(position[k] - ego.position)) >= EGO_GAP and not near.any():
+            keep.append(k)
+    return route[keep], s[keep], speed[keep]

@@ -1,0 +1,5 @@
+"""Transforms that any TorchRL environment or replay buffer can be given."""
+
+from saferl.envs.transforms.projector import ExecutedAction, SafetyProjector
+
+__all__ = ["ExecutedAction", "SafetyProjector"]

@@ -1,0 +1,240 @@
+"""Correction of risky actions on the way to the environment, and of the actions in the buffer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.data import Binary, Composite, Unbounded
+from torchrl.envs.transforms import Transform
+
+from saferl.modules.projection import project
+
+_STASH = "_safety_projection"
+_REPORT: dict[str, torch.dtype | None] = {
+    "action_executed": None,  # the action's own
+    "risk_before": torch.float32,
+    "risk_after": torch.float32,
+    "projection_steps": torch.float32,
+    "intervened": torch.bool,
+    "feasible": torch.bool,
+}
+
+
+class SafetyProjector(Transform):
+    """Executes a corrected action wherever the risk of the proposed one exceeds a limit.
+
+    The correction is :func:`saferl.modules.project` (paper, E8 to E10) on the risk
+    Q_c(s, a) that ``risk`` predicts. Append it outermost, outside a ``SerialEnv`` or
+    ``ParallelEnv``: it then meets the policy's own action, random warm-up actions included, with
+    all environments in one batch. ``action`` in collected data stays the proposed one, whose
+    log-probability the policy knows; :class:`ExecutedAction` swaps it in an off-policy buffer.
+
+    Args:
+        risk: a TensorDictModule that reads observation entries and the action and writes the risk
+            [*B, 1] under its first ``out_key``. If it has a ``bind(tensordict)`` method (as
+            :class:`saferl.modules.CriticEnsemble` does), that is used to compute what does not
+            depend on the action once for all steps.
+        limit: d_thres, the largest risk that is left alone.
+        steps: N_iter, the largest number of correction steps.
+        step_size: eta, the largest move of a coordinate in a step.
+        penalty: lambda_a, see :func:`saferl.modules.project`.
+        keep: ``"last"`` or ``"safest"``, what is executed where no step reached the limit.
+        low: lower end of the action box.
+        high: upper end of the action box.
+        start: fraction of a run after which the correction acts, see :meth:`set_progress`; with 0
+            it acts from the first step on, as printed in Algorithm 1.
+        action_key: the entry of the proposed action.
+
+    Reads the action and the observation at the time of a step. Writes under ``next``:
+    ``action_executed`` [*B, A]; ``risk_before`` and ``risk_after`` [*B, 1], the risks of the
+    proposed and the executed action; ``projection_steps`` [*B, 1] (float32); ``intervened``
+    [*B, 1] (bool), whether the two actions differ; ``feasible`` [*B, 1] (bool), whether the
+    executed one is within the limit. All are zero after a reset. While disabled, actions pass
+    unchanged and the risks are still reported.
+
+    Raises:
+        ValueError: if ``start`` is not in [0, 1], or for a setting that ``project`` refuses.
+        RuntimeError: in a step under ``torch.inference_mode``; ``torch.no_grad`` is fine.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict.nn import TensorDictModule
+        >>> from torchrl.envs import TransformedEnv
+        >>> from torchrl.testing.mocking_classes import ContinuousActionVecMockEnv
+        >>> from saferl.envs.transforms import SafetyProjector
+        >>> risk = TensorDictModule(  # "the first action coordinate is the risk"
+        ...     lambda observation, action: action[..., :1], ["observation", "action"], ["risk"]
+        ... )
+        >>> env = TransformedEnv(ContinuousActionVecMockEnv(), SafetyProjector(risk, limit=0.5))
+        >>> data = env.rollout(3)
+        >>> bool((data["next", "action_executed"][..., 0] <= 0.5).all())
+        True
+    """
+
+    enabled: Tensor
+
+    def __init__(
+        self,
+        risk: TensorDictModuleBase,
+        limit: float,
+        *,
+        steps: int = 50,
+        step_size: float = 0.02,
+        penalty: float = 1.0,
+        keep: str = "last",
+        low: float = -1.0,
+        high: float = 1.0,
+        start: float = 0.0,
+        action_key: NestedKey = "action",
+    ):
+        super().__init__()
+        if not 0.0 <= start <= 1.0:
+            raise ValueError(f"start must be a fraction in [0, 1], got {start}.")
+        self.risk = risk
+        self.limit = float(limit)
+        self.settings = {
+            "steps": steps,
+            "step_size": step_size,
+            "penalty": penalty,
+            "keep": keep,
+            "low": low,
+            "high": high,
+        }
+        # Refuses bad settings now and not in the middle of a run.
+        project(lambda action: action.sum(-1), torch.zeros(0, 1), self.limit, **self.settings)
+        self.start = float(start)
+        self.action_key = unravel_key(action_key)
+        self.register_buffer("enabled", torch.tensor(start == 0.0))
+
+    def set_progress(self, fraction: float) -> None:
+        """Switches the correction on once ``fraction`` of the run is at least ``start``."""
+        self.enabled.fill_(fraction >= self.start)
+
+    def _risk_of_action(self, tensordict: TensorDictBase) -> Callable[[Tensor], Tensor]:
+        """The risk [N, 1] as a function of the action alone [N, A]."""
+        if hasattr(self.risk, "bind"):
+            return self.risk.bind(tensordict)
+        inputs = tensordict.select(*self.risk.in_keys)
+        key = self.risk.out_keys[0]
+        return lambda action: self.risk(inputs.copy().set(self.action_key, action)).get(key)
+
+    @torch.no_grad()
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        inputs = tensordict.select(*self.risk.in_keys).reshape(-1)
+        action = inputs.get(self.action_key)
+
+        before = self._risk_of_action(inputs)(action).reshape(-1)
+        executed, after, steps = action.clone(), before.clone(), torch.zeros_like(before)
+        if self.enabled and (risky := before > self.limit).any():
+            # Only the risky samples are worth up to `steps` evaluations.
+            result = project(
+                self._risk_of_action(inputs[risky]), action[risky], self.limit, **self.settings
+            )
+            executed[risky], after[risky] = result.action, result.risk_after
+            steps[risky] = result.steps.to(steps)
+
+        report = TensorDict(
+            {
+                "action_executed": executed,
+                "risk_before": before.float().unsqueeze(-1),
+                "risk_after": after.float().unsqueeze(-1),
+                "projection_steps": steps.float().unsqueeze(-1),
+                "intervened": (executed != action).any(-1, keepdim=True),
+                "feasible": (after <= self.limit).unsqueeze(-1),
+            },
+            inputs.batch_size,
+        ).reshape(tensordict.batch_size)
+        # Inner transforms may rescale the action from here on: the report stays in policy units.
+        tensordict.set(_STASH, report)
+        return tensordict.set(self.action_key, report.get("action_executed").clone())
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return next_tensordict.update(tensordict.get(_STASH))
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        spec = self.container.full_observation_spec
+        for key in _REPORT:
+            tensordict_reset.set(key, spec[key].zero())
+        return tensordict_reset
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        action = self.parent.full_action_spec[self.action_key]
+        report = observation_spec.clone()
+        for key, dtype in _REPORT.items():
+            if key == "action_executed":
+                spec = Unbounded(action.shape, device=action.device, dtype=action.dtype)
+            else:
+                shape = (*report.shape, 1)
+                kind = Binary if dtype is torch.bool else Unbounded
+                spec = kind(shape=shape, device=action.device, dtype=dtype)
+            report[key] = spec
+        return report
+
+
+class ExecutedAction(Transform):
+    """Makes a replay buffer store the action that the environment executed.
+
+    Off-policy critics must learn from what happened (Algorithm 1, paper: the corrected action is
+    stored). Append it to the buffer, not to the environment; it acts when data is added and leaves
+    samples as they are. On-policy losses must keep the proposed action and need no such transform.
+
+    Args:
+        executed_key: where the executed action is, as :class:`SafetyProjector` writes it.
+        action_key: the entry that gets it.
+        proposed_key: the entry that keeps the policy's action.
+
+    Reads ``("next", "action_executed")`` and ``action`` [*B, A]. Writes ``action``, the executed
+    one, and ``action_proposed``, unless the latter is there already: data that went through once
+    can go through again. The collected data itself is not changed.
+
+    Raises:
+        KeyError: if the data has no executed action.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> from saferl.envs.transforms import ExecutedAction
+        >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), transform=ExecutedAction())
+        >>> data = TensorDict(
+        ...     {"action": torch.ones(3, 2), "next": {"action_executed": torch.zeros(3, 2)}}, [3]
+        ... )
+        >>> _ = buffer.extend(data)
+        >>> buffer[0]["action"], buffer[0]["action_proposed"], data[0]["action"]
+        (tensor([0., 0.]), tensor([1., 1.]), tensor([1., 1.]))
+    """
+
+    def __init__(
+        self,
+        executed_key: NestedKey = ("next", "action_executed"),
+        action_key: NestedKey = "action",
+        proposed_key: NestedKey = "action_proposed",
+    ):
+        super().__init__()
+        self.executed_key = unravel_key(executed_key)
+        self.action_key = unravel_key(action_key)
+        self.proposed_key = unravel_key(proposed_key)
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        executed = tensordict.get(self.executed_key, None)
+        if executed is None:
+            raise KeyError(
+                f"No executed action under {self.executed_key!r}, got the entries "
+                f"{sorted(map(str, tensordict.keys(True, True)))}. "
+                f"Append a SafetyProjector to the environment, or drop ExecutedAction."
+            )
+        stored = tensordict.clone(recurse=False)
+        if stored.get(self.proposed_key, None) is None:
+            stored.set(self.proposed_key, stored.get(self.action_key))
+        # A copy, or a sample edited in place would change both entries of a shared tensor.
+        return stored.set(self.action_key, executed.clone())
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict

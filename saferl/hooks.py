@@ -1,0 +1,67 @@
+"""What a trainer calls besides the learner: multipliers' signals and the projector's progress."""
+
+from __future__ import annotations
+
+from tensordict import TensorDictBase
+
+from saferl.envs.transforms import SafetyProjector
+from saferl.objectives import SACLagLoss
+from saferl.trainer import Trainer
+
+
+class CriticSignal:
+    """Dual ascent on Q_c(s, a) - d_thres of each update's batch (E11)."""
+
+    def register(self, trainer: Trainer) -> None:
+        trainer.learner.after_update.append(self._update)
+        self._lagrange = _multiplier(trainer)
+
+    def _update(self, losses: TensorDictBase) -> None:
+        self._lagrange.update(losses["constraint_violation"])
+
+
+class EpisodeSignal:
+    """Dual ascent on the mean undiscounted cost of fresh episodes, each used once.
+
+    Args:
+        cost_limit: mean episode cost, undiscounted.
+
+    Raises:
+        ValueError: a negative limit.
+    """
+
+    def __init__(self, cost_limit: float):
+        if not cost_limit >= 0:
+            raise ValueError(f"lagrange.signal.cost_limit must be >= 0, got {cost_limit}.")
+        self.cost_limit = cost_limit
+
+    def register(self, trainer: Trainer) -> None:
+        trainer.after_collect.append(self._update)
+        self._lagrange = _multiplier(trainer)
+
+    def _update(self, finished: TensorDictBase, spent: float) -> None:
+        if finished.numel():
+            self._lagrange.update(finished["cost_return"] - self.cost_limit)
+
+
+class ProjectorProgress:
+    """Tells a projector which share of the budget is spent, so that it can begin later.
+
+    Args:
+        projector: the environment's transform.
+    """
+
+    def __init__(self, projector: SafetyProjector):
+        self.projector = projector
+
+    def register(self, trainer: Trainer) -> None:
+        trainer.after_collect.append(lambda _, spent: self.projector.set_progress(spent))
+
+
+def _multiplier(trainer: Trainer):
+    loss = trainer.learner.loss
+    if not isinstance(loss, SACLagLoss):
+        raise ValueError(
+            f"lagrange.signal needs a loss with a multiplier (loss=sac_lag), got {type(loss).__name__}."
+        )
+    return loss.lagrange

@@ -1,0 +1,160 @@
+"""Figures of episodes: what a finished episode was, rates, intervals, files."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy import stats
+from tensordict import TensorDict, TensorDictBase
+
+#: Name of each figure in ``metrics.json``, its short name in tables, and whether it is a rate.
+FIGURES = {
+    "collision_rate": ("CR", True),
+    "success_rate": ("SR", True),
+    "frozen_rate": ("FR", True),
+    "return": ("AER", False),
+    "speed": ("AEV m/s", False),
+    "cost_return": ("cost return", False),
+    "intervention_rate": ("intervention", False),
+}
+
+
+def finished_episodes(data: TensorDictBase) -> TensorDict:
+    """Episodes that end within collected data.
+
+    Args:
+        data: [*B, T] transitions with ``("next", ...)`` ``done``, ``episode_reward``,
+            ``episode_cost`` (TorchRL's RewardSum) and the outcomes ``collision``, ``offroad``,
+            ``success``.
+
+    Returns:
+        [n] TensorDict of float ``return``, ``cost_return``, ``collision`` (with a vehicle or off the
+        road), ``success`` and ``frozen``.
+    """
+    ends = data["next"][data["next", "done"].squeeze(-1)]
+    collision = (ends["collision"] | ends["offroad"]).squeeze(-1).float()
+    success = ends["success"].squeeze(-1).float()
+    return TensorDict(
+        {
+            "return": ends["episode_reward"].squeeze(-1),
+            "cost_return": ends["episode_cost"].squeeze(-1),
+            "collision": collision,
+            "success": success,
+            "frozen": 1.0 - collision - success,
+        },
+        batch_size=ends.batch_size[:1],
+    )
+
+
+class EpisodeWindow:
+    """Means over the last episodes, and over the frames since the last summary's episodes.
+
+    Args:
+        length: how many episodes.
+    """
+
+    KEYS = ("return", "cost_return", "collision", "success", "frozen")
+
+    def __init__(self, length: int = 200):
+        self.length = length
+        self.values = torch.zeros(0, len(self.KEYS))
+
+    def extend(self, data: TensorDictBase) -> TensorDict:
+        """Take collected data [*B, T]; returns its finished episodes [n]."""
+        episodes = finished_episodes(data)
+        rows = torch.stack([episodes[key] for key in self.KEYS], -1).cpu()
+        self.values = torch.cat([self.values, rows])[-self.length :]
+        return episodes
+
+    def summary(self) -> dict[str, float]:
+        """Mean return, cost return and rates of the window; NaN before the first episode."""
+        means = self.values.mean(0).tolist() if len(self.values) else [math.nan] * len(self.KEYS)
+        names = ("return", "cost_return", "collision_rate", "success_rate", "frozen_rate")
+        return {name: round(mean, 6) for name, mean in zip(names, means, strict=True)}
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        return {"values": self.values}
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        self.values = state["values"].clone()
+
+
+class CsvLog:
+    """Rows of scalars; a new column rewrites the file's header, so no value is lost."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def write(self, row: dict[str, float]) -> None:
+        """Append a row (keys are column names)."""
+        rows, columns = [], []
+        if self.path.exists():
+            with self.path.open(newline="") as file:
+                columns = next(csv.reader(file), [])
+        new = [key for key in row if key not in columns]
+        if new and columns:
+            with self.path.open(newline="") as file:
+                rows = list(csv.DictReader(file))
+        columns = [*columns, *new]
+        with self.path.open("w" if new else "a", newline="") as file:
+            writer = csv.DictWriter(file, columns, restval="")
+            if new:
+                writer.writeheader()
+                writer.writerows(rows)
+            writer.writerow(row)
+
+
+def wilson(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
+    """Wilson's interval of a rate.
+
+    >>> [round(bound, 3) for bound in wilson(190, 200)]
+    [0.91, 0.973]
+    """
+    interval = stats.binomtest(int(successes), int(trials)).proportion_ci(level, method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def mean_interval(values: Sequence[float], level: float = 0.95) -> tuple[float, float]:
+    """Student's t interval of a mean; the mean itself when there is one value."""
+    array = np.asarray(values, dtype=float)
+    if len(array) < 2 or np.ptp(array) == 0:
+        return float(array.mean()), float(array.mean())
+    half = stats.t.ppf((1 + level) / 2, len(array) - 1) * stats.sem(array)
+    return float(array.mean() - half), float(array.mean() + half)
+
+
+def summarise(rows: Sequence[dict[str, float]]) -> dict[str, dict[str, float]]:
+    """Mean and 95% interval of each figure over episodes.
+
+    Args:
+        rows: one dict an episode with ``collision``, ``success``, ``frozen`` (0 or 1), ``return``,
+            ``speed``, ``cost_return`` and ``intervention_rate`` (share of its decisions).
+
+    Returns:
+        ``{figure: {"mean", "low", "high"}}``; Wilson's interval for rates of episodes, Student's t
+        otherwise.
+    """
+    figures = {}
+    for name, (_, is_rate) in FIGURES.items():
+        key = name.removesuffix("_rate") if is_rate else name
+        values = [float(row[key]) for row in rows]
+        low, high = wilson(round(sum(values)), len(values)) if is_rate else mean_interval(values)
+        figures[name] = {"mean": sum(values) / len(values), "low": low, "high": high}
+    return figures
+
+
+def table(figures: dict[str, dict[str, float]], title: str = "") -> str:
+    """A plain-text table of :func:`summarise`'s figures; rates in percent."""
+    lines = [title] if title else []
+    lines.append(f"{'':<14}{'mean':>10}   95% interval")
+    for name, (short, _) in FIGURES.items():
+        value, scale = figures[name], 100.0 if name.endswith("_rate") else 1.0
+        unit = " %" if scale == 100.0 else ""
+        mean, low, high = (value[key] * scale for key in ("mean", "low", "high"))
+        lines.append(f"{short:<14}{mean:>10.2f}{unit:<2} [{low:.2f}, {high:.2f}]{unit}")
+    return "\n".join(lines)

@@ -1,0 +1,27 @@
+"""Networks, critics, multipliers and the projection that algorithms are composed of."""
+
+from saferl.modules.actors import GaussianHead, tanh_gaussian_actor
+from saferl.modules.critics import CriticEnsemble, StateValue, value_operator
+from saferl.modules.lagrange import DualAscent, LagrangeMultiplier, PIDMultiplier
+from saferl.modules.mlp import MLPPolicyEncoder, MLPValue
+from saferl.modules.mmam import EGO_SCALE, VEHICLE_SCALE, MMAMPolicyEncoder, MMAMValue
+from saferl.modules.projection import ProjectionResult, project
+
+__all__ = [
+    "EGO_SCALE",
+    "VEHICLE_SCALE",
+    "CriticEnsemble",
+    "DualAscent",
+    "GaussianHead",
+    "LagrangeMultiplier",
+    "MLPPolicyEncoder",
+    "MLPValue",
+    "MMAMPolicyEncoder",
+    "MMAMValue",
+    "PIDMultiplier",
+    "ProjectionResult",
+    "StateValue",
+    "project",
+    "tanh_gaussian_actor",
+    "value_operator",
+]

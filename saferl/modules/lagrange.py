@@ -1,0 +1,178 @@
+"""Lagrange multipliers of a cost constraint: plain dual ascent and PID control."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+def _check(name: str, value: float, *, positive: bool = False) -> float:
+    if not math.isfinite(value) or value < 0 or (positive and value == 0):
+        sign = "> 0" if positive else ">= 0"
+        raise ValueError(f"{name} must be finite and {sign}, got {value}.")
+    return float(value)
+
+
+class LagrangeMultiplier(nn.Module):
+    """A multiplier lambda >= 0 of a constraint ``violation <= 0``: fixed, unless a subclass moves it.
+
+    A loss adds ``multiplier.value.detach() * multiplier.penalty(violation)`` to each sample; a
+    training loop calls :meth:`update` with fresh violations, once for each update.
+
+    A state-wise constraint (``signed=False``) counts only the samples that violate it, and its
+    multiplier cannot fall (E11, paper). A signed one averages surplus and shortage.
+
+    All state is in float64 buffers, which a float32 loss can multiply by without being promoted.
+
+    Args:
+        init: first value.
+        signed: whether satisfied samples count against violated ones.
+        maximum: upper bound of the value, for safety; infinite by default.
+
+    Raises:
+        ValueError: if ``init`` is negative or not finite, or ``maximum < init``.
+
+    Examples:
+        >>> import torch
+        >>> from saferl.modules import LagrangeMultiplier
+        >>> multiplier = LagrangeMultiplier(init=2.0)
+        >>> multiplier.value * multiplier.penalty(torch.tensor([-0.5, 0.5]))
+        tensor([0., 1.])
+    """
+
+    value: Tensor
+
+    def __init__(self, init: float = 1.0, signed: bool = False, maximum: float = math.inf):
+        super().__init__()
+        if not maximum >= _check("init", init):
+            raise ValueError(f"maximum must be >= init, got maximum={maximum} and init={init}.")
+        # In float32, 1 + 1e-4 * violation is 1 for every violation below 6e-4.
+        self.register_buffer("value", torch.tensor(float(init), dtype=torch.float64))
+        self.signed = signed
+        self.maximum = float(maximum)
+
+    def penalty(self, violation: Tensor) -> Tensor:
+        """The term of each sample that lambda multiplies, [*B]: ReLU or identity."""
+        return violation if self.signed else F.relu(violation)
+
+    def _mean(self, violation: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean penalty of the finite entries (float64), and whether there is one."""
+        violation = violation.detach().to(self.value)
+        finite = violation.isfinite()
+        total = self.penalty(torch.where(finite, violation, 0.0)).sum()
+        return total / finite.sum().clamp(min=1), finite.any()
+
+    def update(self, violation: Tensor) -> None:
+        """Moves the multiplier by a violation of any shape, which is averaged; here, not at all.
+
+        Entries that are not finite are left out; with none left (or an empty tensor) nothing
+        changes, so one bad batch cannot turn the multiplier into NaN.
+        """
+
+
+class DualAscent(LagrangeMultiplier):
+    """Projected gradient ascent on the dual (E7 and E11, paper).
+
+    lambda <- max(0, lambda + lr * mean(penalty(violation))), where penalty is ReLU by default
+    (as E11 prints it: the multiplier can only grow) and the identity if ``signed``.
+
+    Args:
+        init: first value.
+        lr: step size alpha_lambda.
+        signed: whether satisfied samples lower the multiplier.
+        maximum: upper bound of the value.
+
+    Raises:
+        ValueError: if ``init < 0``, ``lr <= 0``, either is not finite, or ``maximum < init``.
+
+    Examples:
+        >>> import torch
+        >>> from saferl.modules import DualAscent
+        >>> multiplier = DualAscent(init=1.0, lr=0.1, signed=True)
+        >>> multiplier.update(torch.tensor([0.5, 1.5]))
+        >>> round(multiplier.value.item(), 6)
+        1.1
+    """
+
+    def __init__(
+        self,
+        init: float = 1.0,
+        lr: float = 1e-4,
+        signed: bool = False,
+        maximum: float = math.inf,
+    ):
+        super().__init__(init, signed, maximum)
+        self.lr = _check("lr", lr, positive=True)
+
+    @torch.no_grad()
+    def update(self, violation: Tensor) -> None:
+        mean, _ = self._mean(violation)
+        self.value.copy_((self.value + self.lr * mean).clamp(0.0, self.maximum))
+
+
+class PIDMultiplier(LagrangeMultiplier):
+    """PID control of the multiplier (Stooke, Achiam and Abbeel, 2020, Algorithm 2).
+
+    With e the mean violation and e' the one before it:
+    I <- clip(I + ki * e, 0, maximum), lambda <- clip(kp * e + I + kd * max(0, e - e'), 0, maximum).
+
+    The integral is kept in units of lambda and clipped at every step (anti-windup), so that it lets
+    go as soon as the sign of the violation changes. It starts at ``init``. The derivative acts on
+    rising violations only, and not at the first update.
+
+    Args:
+        kp: gain on the violation.
+        ki: gain on its running sum.
+        kd: gain on its increase since the last update.
+        init: first value.
+        signed: whether satisfied samples lower the multiplier; Stooke et al. do so.
+        maximum: upper bound of the value and of the integral.
+
+    Raises:
+        ValueError: if a gain or ``init`` is negative or not finite, all gains are 0, or
+            ``maximum < init``.
+
+    Examples:
+        >>> import torch
+        >>> from saferl.modules import PIDMultiplier
+        >>> multiplier = PIDMultiplier(kp=1.0, ki=0.5, kd=2.0, init=0.0)
+        >>> for violation in (0.2, 0.4):
+        ...     multiplier.update(torch.tensor(violation))
+        >>> round(multiplier.value.item(), 6)  # 1 * 0.4 + 0.5 * (0.2 + 0.4) + 2 * (0.4 - 0.2)
+        1.1
+    """
+
+    integral: Tensor
+    previous: Tensor
+    started: Tensor
+
+    def __init__(
+        self,
+        kp: float = 0.1,
+        ki: float = 0.01,
+        kd: float = 0.01,
+        init: float = 0.0,
+        signed: bool = True,
+        maximum: float = math.inf,
+    ):
+        super().__init__(init, signed, maximum)
+        self.kp, self.ki, self.kd = _check("kp", kp), _check("ki", ki), _check("kd", kd)
+        if self.kp == self.ki == self.kd == 0:
+            raise ValueError("At least one of kp, ki and kd must be > 0, got 0, 0 and 0.")
+        self.register_buffer("integral", self.value.clone())
+        self.register_buffer("previous", torch.zeros_like(self.value))
+        self.register_buffer("started", torch.tensor(False))
+
+    @torch.no_grad()
+    def update(self, violation: Tensor) -> None:
+        mean, known = self._mean(violation)
+        rise = torch.where(self.started, F.relu(mean - self.previous), 0.0)
+        integral = (self.integral + self.ki * mean).clamp(0.0, self.maximum)
+        value = (self.kp * mean + integral + self.kd * rise).clamp(0.0, self.maximum)
+        self.integral.copy_(torch.where(known, integral, self.integral))
+        self.value.copy_(torch.where(known, value, self.value))
+        self.previous.copy_(torch.where(known, mean, self.previous))
+        self.started.logical_or_(known)

@@ -1,0 +1,150 @@
+"""Plain MLPs over the flattened scene: the encoder and value network of the baselines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from saferl.modules.mmam import EGO_SCALE, VEHICLE_SCALE, feature_scale, scale_vehicles
+
+
+class _FlatScene(nn.Module):
+    """Scaled ego features and all vehicle rows in one vector [*B, 9 + 6 rows]."""
+
+    def __init__(self, rows: int, ego_scale: Sequence[float], vehicle_scale: Sequence[float]):
+        super().__init__()
+        self.rows = rows
+        self.size = len(ego_scale) + rows * len(vehicle_scale)
+        self.register_buffer("ego_scale", feature_scale("ego_scale", ego_scale))
+        self.register_buffer("vehicle_scale", feature_scale("vehicle_scale", vehicle_scale))
+
+    def forward(self, ego: Tensor, vehicles: Tensor) -> Tensor:
+        if vehicles.shape[-2] != self.rows:
+            raise ValueError(
+                f"vehicles must have rows={self.rows} rows, got {vehicles.shape[-2]}: an MLP is "
+                f"bound to the number of rows it was built for. Set rows to the environment's."
+            )
+        features, _ = scale_vehicles(vehicles, self.vehicle_scale)
+        return torch.cat([ego / self.ego_scale, features.flatten(-2)], dim=-1)
+
+
+def _hidden(size: int, width: int, depth: int, activation: type[nn.Module]) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for _ in range(depth):
+        layers += [nn.Linear(size, width), activation()]
+        size = width
+    return nn.Sequential(*layers)
+
+
+class MLPPolicyEncoder(nn.Module):
+    """Hidden layers over ego and vehicles, flattened: features of a scene for a policy.
+
+    Args:
+        rows: M, the number of vehicle rows; other numbers are refused.
+        width: units of each hidden layer, and the size of the output.
+        depth: number of hidden layers, at least 1.
+        activation: the module class of the activation, one without parameters.
+        ego_scale: divisors of the ego features.
+        vehicle_scale: divisors of a vehicle's features; I_veh comes first.
+
+    Reads ``ego`` [*B, 9] and ``vehicles`` [*B, M, 6], SI units; returns features [*B, width].
+
+    Raises:
+        ValueError: if ``depth < 1``, a feature scale is not positive and finite, or (at the call)
+            the number of vehicle rows is not ``rows``.
+
+    Examples:
+        >>> import torch
+        >>> from saferl.modules import MLPPolicyEncoder
+        >>> MLPPolicyEncoder(rows=3, width=32)(torch.randn(5, 9), torch.zeros(5, 3, 6)).shape
+        torch.Size([5, 32])
+    """
+
+    def __init__(
+        self,
+        rows: int = 11,
+        width: int = 256,
+        depth: int = 3,
+        activation: type[nn.Module] = nn.GELU,
+        ego_scale: Sequence[float] = EGO_SCALE,
+        vehicle_scale: Sequence[float] = VEHICLE_SCALE,
+    ):
+        super().__init__()
+        if depth < 1:
+            raise ValueError(f"depth must be >= 1, got {depth}.")
+        self.scene = _FlatScene(rows, ego_scale, vehicle_scale)
+        self.layers = _hidden(self.scene.size, width, depth, activation)
+
+    def forward(self, ego: Tensor, vehicles: Tensor) -> Tensor:
+        return self.layers(self.scene(ego, vehicles))
+
+
+class MLPValue(nn.Module):
+    """Action value from an MLP over ego, vehicles and action, flattened.
+
+    Args:
+        rows: M, the number of vehicle rows; other numbers are refused.
+        width: units of each hidden layer.
+        depth: number of hidden layers, at least 1.
+        action_dim: size of the action.
+        activation: the module class of the activation, one without parameters.
+        ego_scale: divisors of the ego features.
+        vehicle_scale: divisors of a vehicle's features; I_veh comes first.
+
+    Reads ``ego`` [*B, 9], ``vehicles`` [*B, M, 6] (SI units) and ``action`` [*B, 2] in [-1, 1];
+    returns values [*B, 1].
+
+    Raises:
+        ValueError: as :class:`MLPPolicyEncoder`.
+
+    Examples:
+        >>> import torch
+        >>> from saferl.modules import MLPValue
+        >>> value = MLPValue(rows=3, width=32)
+        >>> value(torch.randn(5, 9), torch.zeros(5, 3, 6), torch.zeros(5, 2)).shape
+        torch.Size([5, 1])
+    """
+
+    def __init__(
+        self,
+        rows: int = 11,
+        width: int = 256,
+        depth: int = 3,
+        action_dim: int = 2,
+        activation: type[nn.Module] = nn.GELU,
+        ego_scale: Sequence[float] = EGO_SCALE,
+        vehicle_scale: Sequence[float] = VEHICLE_SCALE,
+    ):
+        super().__init__()
+        if depth < 1:
+            raise ValueError(f"depth must be >= 1, got {depth}.")
+        self.scene = _FlatScene(rows, ego_scale, vehicle_scale)
+        self.first = nn.Linear(self.scene.size + action_dim, width)
+        self.activation = activation()
+        sizes = [width] * (depth - 1) + [1]
+        self.layers = nn.ModuleList(nn.Linear(width, size) for size in sizes)
+
+    def condition(self, ego: Tensor, vehicles: Tensor) -> Callable[[Tensor], Tensor]:
+        """The value as a function of the action alone, [*B, A] -> [*B, 1], in this scene.
+
+        The function holds the tensors that the module has now, not the module, so it stays valid
+        when a functional call puts the module's own parameters back.
+        """
+        on_scene, on_action = self.first.weight.tensor_split([self.scene.size], dim=-1)
+        scene = F.linear(self.scene(ego, vehicles), on_scene, self.first.bias)
+        weights = [(layer.weight, layer.bias) for layer in self.layers]
+        activation = self.activation
+
+        def value(action: Tensor) -> Tensor:
+            hidden = scene + F.linear(action, on_action)
+            for weight, bias in weights:
+                hidden = F.linear(activation(hidden), weight, bias)
+            return hidden
+
+        return value
+
+    def forward(self, ego: Tensor, vehicles: Tensor, action: Tensor) -> Tensor:
+        return self.condition(ego, vehicles)(action)

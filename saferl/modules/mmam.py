@@ -1,0 +1,263 @@
+"""Multi-hop and MLP-mixed attention (MMAM): the paper's policy encoder and value network."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+EGO_SCALE = (1.0, 50.0, 50.0, 10.0, 10.0, math.pi, 1.0, 50.0, 100.0)
+"""Divisors of the ego features (I_veh, x, y, v_x, v_y, phi, omega, d_veh, d_des)."""
+VEHICLE_SCALE = (1.0, 50.0, 50.0, 10.0, 10.0, math.pi)
+"""Divisors of a vehicle's features (I_veh, dx, dy, dv_x, dv_y, phi)."""
+
+_MASKED = -1e9
+
+
+def feature_scale(name: str, values: Sequence[float]) -> Tensor:
+    """The divisors of a row of features as a tensor; every one must be positive and finite."""
+    scale = torch.as_tensor(values, dtype=torch.get_default_dtype())
+    if scale.ndim != 1 or not bool((scale.isfinite() & (scale > 0)).all()):
+        raise ValueError(f"{name} must be positive finite numbers, got {tuple(values)}.")
+    return scale
+
+
+def scale_vehicles(vehicles: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+    """Scaled features [*B, M, F], zero where the row is absent, and presence [*B, M] (bool)."""
+    present = vehicles[..., 0] > 0
+    return torch.where(present.unsqueeze(-1), vehicles / scale, 0.0), present
+
+
+class _SceneTokens(nn.Module):
+    """Embeds the EV and the SVs apart (linear + GELU): tokens [*B, 1 + M, d] and presence."""
+
+    def __init__(self, width: int, ego_scale: Sequence[float], vehicle_scale: Sequence[float]):
+        super().__init__()
+        self.register_buffer("ego_scale", feature_scale("ego_scale", ego_scale))
+        self.register_buffer("vehicle_scale", feature_scale("vehicle_scale", vehicle_scale))
+        self.ego = nn.Linear(len(ego_scale), width)
+        self.vehicle = nn.Linear(len(vehicle_scale), width)
+
+    def forward(self, ego: Tensor, vehicles: Tensor) -> tuple[Tensor, Tensor]:
+        features, present = scale_vehicles(vehicles, self.vehicle_scale)
+        ego_token = F.gelu(self.ego(ego / self.ego_scale)).unsqueeze(-2)
+        tokens = torch.cat([ego_token, F.gelu(self.vehicle(features))], dim=-2)
+        # The EV is always there, so no softmax ever runs over absent rows alone.
+        return tokens, F.pad(present, (1, 0), value=True)
+
+
+class _Attention(nn.Module):
+    """What both hops share: the number of heads and the divisor of the logits (AttnE1)."""
+
+    def __init__(self, width: int, heads: int, scale: str):
+        super().__init__()
+        if width % heads:
+            raise ValueError(f"width must be a multiple of heads, got {width} and {heads}.")
+        if scale not in ("paper", "per_head"):
+            raise ValueError(f"scale must be 'paper' or 'per_head', got {scale!r}.")
+        self.heads = heads
+        self.divisor = math.sqrt(width if scale == "paper" else width // heads)
+        self.merge = nn.Linear(width, width, bias=False)
+
+
+class _SelfAttention(_Attention):
+    """Multi-head self-attention over all rows: tokens [*B, N, d] -> [*B, N, d]."""
+
+    def __init__(self, width: int, heads: int, scale: str):
+        super().__init__(width, heads, scale)
+        self.query_key_value = nn.Linear(width, 3 * width, bias=False)
+
+    def forward(self, tokens: Tensor, present: Tensor) -> Tensor:
+        split = self.query_key_value(tokens).unflatten(-1, (3, self.heads, -1))
+        query, key, value = (part.transpose(-3, -2) for part in split.unbind(-3))
+        logits = query @ key.mT / self.divisor
+        logits = logits.masked_fill(~present[..., None, None, :], _MASKED)
+        return self.merge((logits.softmax(-1) @ value).transpose(-3, -2).flatten(-2))
+
+
+class _EgoAttention(_Attention):
+    """Multi-head attention whose only query is the EV's row.
+
+    One query needs no keys or values of the tokens: with key_j = W_K x_j, a head's logit is
+    x_j . (W_K^T q), and its output W_V (sum_j w_j x_j). Both are exact, and cost O(d^2) for a scene
+    in place of O(N d^2).
+    """
+
+    def __init__(self, width: int, heads: int, scale: str):
+        super().__init__(width, heads, scale)
+        self.query = nn.Linear(width, width, bias=False)
+        self.key = nn.Linear(width, width, bias=False)
+        self.value = nn.Linear(width, width, bias=False)
+
+    def folded_query(self, row: Tensor) -> Tensor:
+        """W_K^T q / divisor of each head: row [*B, d] -> [*B, h, d]."""
+        query = self.query(row).unflatten(-1, (self.heads, -1))
+        weight = self.key.weight.unflatten(0, (self.heads, -1))
+        return torch.einsum("...hk,hkd->...hd", query, weight) / self.divisor
+
+    def folded_value(self, readout: Tensor) -> Tensor:
+        """What a token adds to `readout . output` in each head: readout [d] -> [h, d]."""
+        readout = (readout @ self.merge.weight).unflatten(-1, (self.heads, -1))
+        return torch.einsum("hk,hkd->hd", readout, self.value.weight.unflatten(0, (self.heads, -1)))
+
+    def forward(self, row: Tensor, tokens: Tensor, present: Tensor) -> Tensor:
+        logits = self.folded_query(row) @ tokens.mT
+        weights = logits.masked_fill(~present.unsqueeze(-2), _MASKED).softmax(-1)
+        weight = self.value.weight.unflatten(0, (self.heads, -1))
+        return self.merge(torch.einsum("...hd,hkd->...hk", weights @ tokens, weight).flatten(-2))
+
+
+class MMAMPolicyEncoder(nn.Module):
+    """Two-hop attention features of a scene for a policy (paper, Fig. f5 and AttnE1).
+
+    The EV and the SVs are embedded apart (linear + GELU) into Z_1; multi-head self-attention over
+    all rows is added to Z_1; the EV's row of that sum is then the only query of a multi-head
+    ego-attention over the sum (keys and values from there: ours). The operator T and the W_i of
+    AttnE1 are two linear maps in a row, hence one matrix here.
+
+    Absent rows (I_veh = 0) are zeroed and get -1e9 before the softmax, so neither the order of the
+    SVs nor the number of absent rows matters, and any number of rows works, none included.
+
+    Args:
+        width: d, the size of a token and of the output.
+        heads: h, a divisor of ``width``.
+        scale: logits are divided by sqrt(d) (``"paper"``, as printed) or sqrt(d / h)
+            (``"per_head"``, the usual one).
+        ego_scale: divisors of the ego features; their number is the size of ``ego``.
+        vehicle_scale: divisors of a vehicle's features; I_veh comes first.
+
+    Reads ``ego`` [*B, 9] and ``vehicles`` [*B, M, 6], SI units; returns features [*B, width].
+
+    Raises:
+        ValueError: if ``heads`` does not divide ``width``, ``scale`` is unknown, or a feature scale
+            is not positive and finite.
+
+    Examples:
+        >>> import torch
+        >>> from saferl.modules import MMAMPolicyEncoder
+        >>> encoder = MMAMPolicyEncoder(width=32)
+        >>> encoder(torch.randn(5, 9), torch.zeros(5, 11, 6)).shape
+        torch.Size([5, 32])
+    """
+
+    def __init__(
+        self,
+        width: int = 256,
+        heads: int = 4,
+        scale: str = "paper",
+        ego_scale: Sequence[float] = EGO_SCALE,
+        vehicle_scale: Sequence[float] = VEHICLE_SCALE,
+    ):
+        super().__init__()
+        self.tokens = _SceneTokens(width, ego_scale, vehicle_scale)
+        self.self_attention = _SelfAttention(width, heads, scale)
+        self.ego_attention = _EgoAttention(width, heads, scale)
+
+    def forward(self, ego: Tensor, vehicles: Tensor) -> Tensor:
+        tokens, present = self.tokens(ego, vehicles)
+        tokens = tokens + self.self_attention(tokens, present)
+        return self.ego_attention(tokens[..., 0, :], tokens, present)
+
+
+class MMAMValue(nn.Module):
+    """Action value from ego-attention and an MLP branch (paper, Fig. f5 and AttnE2).
+
+    Q(s, a) = Y_attn . W_attn + Y_mlp . W_mlp over the N + 2 tokens of Z_2 (EV, SVs, action). Y_attn
+    is one hop of multi-head ego-attention. Y_mlp is permutation-invariant (ours): a layer of
+    ``pair_width`` units sees each SV together with the EV and the action, its mean over the SVs
+    that are present joins the tokens of EV and action in a layer of ``width`` units. All
+    activations are GELU.
+
+    Args:
+        width: d, the size of a token and of both branches.
+        heads: h, a divisor of ``width``.
+        scale: ``"paper"`` or ``"per_head"``, see :class:`MMAMPolicyEncoder`.
+        action_dim: size of the action.
+        pair_width: units of the layer applied to each SV (ours); ``None`` is ``width // 4``.
+        ego_scale: divisors of the ego features.
+        vehicle_scale: divisors of a vehicle's features; I_veh comes first.
+
+    Reads ``ego`` [*B, 9], ``vehicles`` [*B, M, 6] (SI units) and ``action`` [*B, 2] in [-1, 1];
+    returns values [*B, 1].
+
+    Raises:
+        ValueError: as :class:`MMAMPolicyEncoder`.
+
+    Examples:
+        >>> import torch
+        >>> from saferl.modules import MMAMValue
+        >>> value = MMAMValue(width=32)
+        >>> ego, vehicles, action = torch.randn(5, 9), torch.zeros(5, 11, 6), torch.zeros(5, 2)
+        >>> value(ego, vehicles, action).shape
+        torch.Size([5, 1])
+        >>> of_action = value.condition(ego, vehicles)  # the scene's part is computed once
+        >>> torch.allclose(of_action(action), value(ego, vehicles, action))
+        True
+    """
+
+    def __init__(
+        self,
+        width: int = 256,
+        heads: int = 4,
+        scale: str = "paper",
+        action_dim: int = 2,
+        pair_width: int | None = None,
+        ego_scale: Sequence[float] = EGO_SCALE,
+        vehicle_scale: Sequence[float] = VEHICLE_SCALE,
+    ):
+        super().__init__()
+        pair_width = width // 4 if pair_width is None else pair_width
+        self.tokens = _SceneTokens(width, ego_scale, vehicle_scale)
+        self.action = nn.Linear(action_dim, width)
+        self.attention = _EgoAttention(width, heads, scale)
+        self.pair = nn.Linear(3 * width, pair_width)  # on (SV, EV, action)
+        self.joint = nn.Linear(2 * width + pair_width, width)  # on (EV, action, pooled pairs)
+        self.w_attn = nn.Linear(width, 1, bias=False)
+        self.w_mlp = nn.Linear(width, 1, bias=False)
+
+    def condition(self, ego: Tensor, vehicles: Tensor) -> Callable[[Tensor], Tensor]:
+        """The value as a function of the action alone, [*B, A] -> [*B, 1], in this scene.
+
+        The function holds the tensors that the module has now, not the module, so it stays valid
+        when a functional call puts the module's own parameters back.
+        """
+        tokens, present = self.tokens(ego, vehicles)
+        ego_token, vehicle_tokens = tokens[..., 0, :], tokens[..., 1:, :]
+        query = self.attention.folded_query(ego_token)
+        readout = self.attention.folded_value(self.w_attn.weight.squeeze(0))
+        logits = (query @ tokens.mT).masked_fill(~present.unsqueeze(-2), _MASKED)
+        readings = (tokens @ readout.mT).mT
+
+        # A layer on concatenated tokens is a sum of one product for each of them.
+        width = ego_token.shape[-1]
+        on_vehicle, on_ego, pair_on_action = self.pair.weight.split(width, dim=-1)
+        pair_scene = F.linear(vehicle_tokens, on_vehicle, self.pair.bias)
+        pair_scene = pair_scene + F.linear(ego_token, on_ego).unsqueeze(-2)
+        on_ego, joint_on_action, joint_on_pairs = self.joint.weight.split(
+            [width, width, self.pair.out_features], dim=-1
+        )
+        joint_scene = F.linear(ego_token, on_ego, self.joint.bias)
+        share = present[..., 1:, None].to(tokens.dtype)
+        share = share / share.sum(-2, keepdim=True).clamp(min=1.0)
+        action_weight, action_bias, w_mlp = self.action.weight, self.action.bias, self.w_mlp.weight
+
+        def value(action: Tensor) -> Tensor:
+            token = F.gelu(F.linear(action, action_weight, action_bias))
+            logit = (query @ token.unsqueeze(-1)).squeeze(-1)
+            weights = torch.cat([logits, logit.unsqueeze(-1)], dim=-1).softmax(-1)
+            y_attn = (weights[..., :-1] * readings).sum((-2, -1))
+            y_attn = y_attn + (weights[..., -1] * (token @ readout.mT)).sum(-1)
+            pairs = F.gelu(pair_scene + F.linear(token, pair_on_action).unsqueeze(-2))
+            pooled = (pairs * share).sum(-2)
+            y_mlp = (
+                joint_scene + F.linear(token, joint_on_action) + F.linear(pooled, joint_on_pairs)
+            )
+            return y_attn.unsqueeze(-1) + F.linear(F.gelu(y_mlp), w_mlp)
+
+        return value
+
+    def forward(self, ego: Tensor, vehicles: Tensor, action: Tensor) -> Tensor:
+        return self.condition(ego, vehicles)(action)

@@ -1,0 +1,209 @@
+"""Cost critics beside the reward critics of an off-policy loss (E13)."""
+
+from __future__ import annotations
+
+import math
+from copy import deepcopy
+
+import torch
+from tensordict import TensorDictBase, TensorDictParams, unravel_key
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives.utils import _cache_values, _vmap_func, distance_loss
+from torchrl.objectives.value import ValueEstimatorBase
+
+from saferl.modules import CriticEnsemble, LagrangeMultiplier
+
+
+class CostCriticLoss(LossModule):
+    r"""Base of the losses of an off-policy critic under a cost constraint.
+
+    Comes before a loss of TorchRL among the bases of a class, as in
+    ``class SACLagLoss(CostCriticLoss, SACLoss)``, and gives it an ensemble of cost
+    critics with targets, a second value estimator, which reads the cost, and
+
+    .. math::
+
+        L_c = E\Big[\sum_i \tfrac12 \big(Q_{c,i}(s, a) - c
+              - \gamma (1 - \tau) \max_j Q^-_{c,j}(s', \tilde a')\big)^2\Big] \quad (E13, paper)
+
+    where :math:`\tau` is ``terminated``. The subclass calls :meth:`_add_cost_critic`
+    once its other networks are there, and defines :meth:`_sample_next`.
+    """
+
+    SUPPORTED_VALUE_ESTIMATORS = (ValueEstimators.TD0,)
+
+    cost_critic: TensorDictModule
+    cost_critic_params: TensorDictParams
+    target_cost_critic_params: TensorDictParams
+    lagrange: LagrangeMultiplier
+    cost_limit: Tensor
+
+    def _add_cost_critic(
+        self,
+        cost_critic: TensorDictModule | list[TensorDictModule],
+        num_cost_critics: int,
+        *,
+        lagrange: LagrangeMultiplier,
+        cost_limit: float,
+        create_target_params: bool,
+        compare_against: list[nn.Parameter] | None,
+    ) -> None:
+        if not (math.isfinite(cost_limit) and cost_limit >= 0):
+            raise ValueError(f"cost_limit must be >= 0, got {cost_limit}.")
+        if num_cost_critics < 1:
+            raise ValueError(f"num_cost_critics must be >= 1, got {num_cost_critics}.")
+        self.num_cost_critics = num_cost_critics
+        self.convert_to_functional(
+            cost_critic,
+            "cost_critic",
+            num_cost_critics,
+            create_target_params=create_target_params,
+            compare_against=compare_against,
+        )
+        self.lagrange = lagrange
+        device = next(self.parameters()).device
+        self.register_buffer("cost_limit", torch.tensor(float(cost_limit), device=device))
+        # The other base chose these before it could see the cost critic.
+        self._vmap_randomness = None
+        self._make_vmap()
+        # Made here, not at the first call: a fresh loss then loads a state_dict strictly.
+        self._default_value_estimator()
+
+    def _make_vmap(self) -> None:
+        super()._make_vmap()
+        if "cost_critic" in self.__dict__:
+            self._vmap_cost_criticN0 = _vmap_func(
+                self.cost_critic,
+                (None, 0),
+                randomness=self.vmap_randomness,
+                pseudo_vmap=self.deactivate_vmap,
+            )
+
+    def make_value_estimator(
+        self,
+        value_type: ValueEstimators | ValueEstimatorBase | type | None = None,
+        **hyperparams,
+    ) -> None:
+        """Build the value estimators of the reward and of the cost, alike.
+
+        Args:
+            value_type (optional): as in TorchRL's losses. Defaults to TD(0).
+            **hyperparams: of the estimator, such as ``gamma``.
+
+        Raises:
+            ValueError: ``gamma`` lies outside [0, 1].
+        """
+        gamma = hyperparams.get("gamma", 0.0)
+        if not 0 <= gamma <= 1:
+            raise ValueError(f"gamma must be in [0, 1], got {gamma}.")
+        super().make_value_estimator(value_type, **hyperparams)
+        self._cost_value_estimator = deepcopy(self._value_estimator)
+        self._forward_value_estimator_keys()
+
+    def _forward_value_estimator_keys(self, **kwargs) -> None:
+        # The other base calls this before the cost critic is known, so the input keys
+        # are left to be worked out when somebody asks for them.
+        self._in_keys = None
+        if self._value_estimator is None:
+            return
+        shared = {"done": self.tensor_keys.done, "terminated": self.tensor_keys.terminated}
+        self._value_estimator.set_keys(
+            value=self.tensor_keys.value, reward=self.tensor_keys.reward, **shared
+        )
+        self._cost_value_estimator.set_keys(
+            value=self.tensor_keys.state_action_cost_value, reward=self.tensor_keys.cost, **shared
+        )
+
+    @property
+    def _observation_keys(self) -> list[NestedKey]:
+        networks = (self.actor_network, self.qvalue_network, self.cost_critic)
+        keys = dict.fromkeys(key for network in networks for key in network.in_keys)
+        keys.pop(self.tensor_keys.action, None)
+        return list(keys)
+
+    def _set_in_keys(self) -> None:
+        following = [
+            *self._observation_keys,
+            self.tensor_keys.reward,
+            self.tensor_keys.cost,
+            self.tensor_keys.done,
+            self.tensor_keys.terminated,
+        ]
+        self._in_keys = [
+            self.tensor_keys.action,
+            *self._observation_keys,
+            *(unravel_key(("next", key)) for key in following),
+        ]
+
+    @property
+    def cost_value(self) -> CriticEnsemble:
+        """The largest cost value over the members, on their live parameters.
+
+        A view that owns no state. It keeps following the parameters as they are
+        trained and loaded, but not a ``to(device)`` that replaces them: take it anew.
+        """
+        return CriticEnsemble(
+            self.cost_critic,
+            params=self.cost_critic_params,
+            reduce="max",
+            action_key=self.tensor_keys.action,
+        )
+
+    @property
+    @_cache_values
+    def _cached_detached_cost_critic_params(self) -> TensorDictBase:
+        return self.cost_critic_params.detach()
+
+    def cost_loss(
+        self,
+        tensordict: TensorDictBase,
+        next_sample: tuple[TensorDictBase, Tensor] | None = None,
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """E13: cost critics against the largest target value, with no entropy.
+
+        Args:
+            tensordict (TensorDictBase): the batch.
+            next_sample (optional): next state with the policy's action, and its
+                log-probability ``[*B]``. Drawn afresh by default.
+
+        Raises:
+            KeyError: the batch holds no cost.
+        """
+        if tensordict.get(("next", self.tensor_keys.cost), None) is None:
+            raise KeyError(
+                f"The batch has no entry {('next', self.tensor_keys.cost)}; under 'next' it has "
+                f"{sorted(map(str, tensordict['next'].keys()))}. "
+                "Name your cost with loss.set_keys(cost=...)."
+            )
+        next_state, _ = next_sample or self._sample_next(tensordict)
+        with torch.no_grad():
+            next_value = self._cost_values(next_state, self.target_cost_critic_params).max(0)[0]
+            target = self._cost_value_estimator.value_estimate(
+                tensordict.copy(), next_value=next_value
+            )
+        predicted = self._cost_values(tensordict, self.cost_critic_params)
+        return self._bellman_loss(predicted, target, tensordict)
+
+    def _cost_values(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
+        """Value of each member, ``[n, *B, 1]``."""
+        inputs = tensordict.select(*self.cost_critic.in_keys)
+        return self._vmap_cost_criticN0(inputs, params)[self.tensor_keys.state_action_cost_value]
+
+    def _bellman_loss(
+        self, predicted: Tensor, target: Tensor, tensordict: TensorDictBase
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Half the squared error of ``predicted`` ``[n, *B, 1]``, summed over its members."""
+        predicted = predicted.squeeze(-1)
+        target = target.squeeze(-1).expand_as(predicted)
+        loss = 0.5 * distance_loss(predicted, target, loss_function="l2").sum(0)
+        loss = self._reduce_loss(
+            loss, tensordict=tensordict, weights=self._maybe_get_priority_weight(tensordict)
+        )
+        return loss, {"td_error": (predicted - target).detach().abs().max(0)[0]}
+
+    def _sample_next(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
+        """Next state with an action of the policy, and its log-probability ``[*B]``."""
+        raise NotImplementedError

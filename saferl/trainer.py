@@ -1,0 +1,288 @@
+"""The training loop: collect, store, learn, record, save."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.data import ReplayBuffer
+from torchrl.objectives import LossModule, SoftUpdate
+from tqdm import tqdm
+
+from saferl.checkpoint import CollectorState, GrowingFiles, RunCheckpoint
+from saferl.metrics import CsvLog, EpisodeWindow
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How long to train: a number of episodes or of frames, whichever is given.
+
+    >>> Budget(episodes=100).spent(frames=0, episodes=25)
+    0.25
+    """
+
+    episodes: int | None = None
+    frames: int | None = None
+
+    def __post_init__(self):
+        for name in ("episodes", "frames"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name} must be >= 1, got {value}.")
+        if (self.episodes is None) == (self.frames is None):
+            raise ValueError(
+                "Give one budget, episodes or frames (the other null): "
+                f"got episodes={self.episodes}, frames={self.frames}."
+            )
+
+    def spent(self, frames: int, episodes: int) -> float:
+        """Fraction of the budget that is spent, in [0, 1]."""
+        done, whole = (episodes, self.episodes) if self.episodes else (frames, self.frames)
+        return min(1.0, done / whole)
+
+
+class Learner:
+    """One gradient step on every term of a loss, and the target networks' soft update.
+
+    Args:
+        loss: any TorchRL LossModule.
+        optimizer: over the loss's parameters; each group holds ``schedule``, its (first, last)
+            learning rate, linear in the fraction of the budget that is spent.
+        target_updater: soft update of the loss's targets.
+        after_update: called with the loss's output after each step (a multiplier, for example).
+        compile: compile the loss.
+    """
+
+    def __init__(
+        self,
+        loss: LossModule,
+        optimizer: torch.optim.Optimizer,
+        target_updater: SoftUpdate,
+        after_update: list[Callable[[TensorDictBase], None]] | None = None,
+        compile: bool = False,
+    ):
+        self.loss, self.optimizer, self.target_updater = loss, optimizer, target_updater
+        self.after_update = after_update or []
+        self._forward = torch.compile(loss) if compile else loss
+
+    def schedule(self, spent: float) -> None:
+        """Set the learning rates for a fraction of the budget."""
+        for group in self.optimizer.param_groups:
+            first, last = group["schedule"]
+            group["lr"] = first + (last - first) * spent
+
+    def update(self, batch: TensorDictBase) -> TensorDict:
+        """Returns the loss terms and metrics, detached scalars."""
+        losses = self._forward(batch)
+        total = sum(value for key, value in losses.items() if key.startswith("loss_"))
+        total.backward()
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        self.target_updater.step()
+        for hook in self.after_update:
+            hook(losses)
+        return losses.detach()
+
+
+@dataclass
+class Progress:
+    """Counters of a run; a checkpoint component."""
+
+    frames: int = 0
+    episodes: int = 0
+    updates: int = 0
+    owed: float = 0.0
+    last_record: int = 0
+    last_save: int = 0
+
+    def state_dict(self) -> dict[str, float]:
+        return dict(self.__dict__)
+
+    def load_state_dict(self, state: dict[str, float]) -> None:
+        self.__dict__.update(state)
+
+
+class Clock:
+    """Wall-clock seconds by phase, kept out of ``metrics.csv``."""
+
+    def __init__(self):
+        self.seconds: dict[str, float] = {"collect": 0.0, "learn": 0.0, "other": 0.0}
+        self._last = time.perf_counter()
+
+    @contextmanager
+    def phase(self, name: str):
+        start = time.perf_counter()
+        self.seconds["other"] += start - self._last
+        try:
+            yield
+        finally:
+            self._last = time.perf_counter()
+            self.seconds[name] += self._last - start
+
+
+@dataclass
+class Trainer:
+    """Trains from built parts; it knows none of them by name.
+
+    Attributes:
+        run: folder of the run's files.
+        collector: yields [B, T] batches of transitions.
+        buffer: replay buffer; its transforms decide what is stored and what is sampled.
+        learner: makes one update from a sampled batch.
+        budget: how long.
+        stored: keys of a transition that the buffer keeps, where they exist.
+        updates_per_frame: gradient updates for each collected frame.
+        warmup_frames: collected before the first update.
+        record_every: frames between two rows of ``metrics.csv``.
+        save_every: frames between two checkpoints.
+        after_collect: called with each batch's finished episodes (a TensorDict of per-episode
+            ``return``, ``cost_return`` and outcomes, [n, 1]) and the fraction of the budget spent.
+        loggers: TorchRL loggers that receive the scalars of each row.
+        checkpointed: further components of a checkpoint.
+    """
+
+    run: Path
+    collector: Collector
+    buffer: ReplayBuffer
+    learner: Learner
+    budget: Budget
+    stored: Sequence[NestedKey]
+    updates_per_frame: float = 0.25
+    warmup_frames: int = 1000
+    record_every: int = 2000
+    save_every: int = 50_000
+    keep_checkpoints: int = 1
+    window: EpisodeWindow = field(default_factory=EpisodeWindow)
+    after_collect: list[Callable[[TensorDictBase, float], None]] = field(default_factory=list)
+    loggers: list = field(default_factory=list)
+    checkpointed: dict = field(default_factory=dict)
+
+    def __post_init__(self):
+        for name, least in (("updates_per_frame", 0), ("warmup_frames", 1), ("record_every", 1), ("save_every", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be >= {least}, got {getattr(self, name)}.")
+        self.progress, self.clock = Progress(), Clock()
+        self.metrics = CsvLog(self.run / "metrics.csv")
+        self.timing = CsvLog(self.run / "timing.csv")
+        self._sums: dict[str, Tensor] = {}
+        self._count = 0
+        self.checkpoint = RunCheckpoint(
+            self.run,
+            self.keep_checkpoints,
+            loss=self.learner.loss,
+            optimizer=self.learner.optimizer,
+            buffer=self.buffer,
+            collector=CollectorState(self.collector),
+            progress=self.progress,
+            window=self.window,
+            record=self,
+            files=GrowingFiles(self.metrics.path, self.timing.path),
+            **self.checkpointed,
+        )
+
+    def state_dict(self) -> dict:
+        """Means of the loss terms since the last row."""
+        return {"sums": self._sums, "count": self._count}
+
+    def load_state_dict(self, state: dict) -> None:
+        self._sums, self._count = dict(state["sums"]), state["count"]
+
+    def resume(self) -> None:
+        """Continue from the newest checkpoint of the run."""
+        path = self.checkpoint.load_latest()
+        log.info("Resumed %s at frame %d.", path, self.progress.frames)
+
+    def train(self) -> None:
+        """Train until the budget is spent; a checkpoint is left at the end and at an interrupt."""
+        progress = self.progress
+        bar = tqdm(
+            total=self.budget.episodes or self.budget.frames,
+            initial=progress.episodes if self.budget.episodes else progress.frames,
+            unit="episode" if self.budget.episodes else "frame",
+            desc="train",
+            dynamic_ncols=True,
+            mininterval=1.0,
+        )
+        batches = iter(self.collector)
+        try:
+            while self.budget.spent(progress.frames, progress.episodes) < 1.0:
+                with self.clock.phase("collect"):
+                    data = next(batches)
+                self._take(data)
+                bar.update((progress.episodes if self.budget.episodes else progress.frames) - bar.n)
+                if progress.frames - progress.last_record >= self.record_every:
+                    self._record()
+                    bar.set_postfix(self.window.summary())
+                if progress.frames - progress.last_save >= self.save_every:
+                    self.save()
+        except KeyboardInterrupt:
+            log.warning("Interrupted at frame %d: saving a checkpoint.", progress.frames)
+            self.save()
+            raise
+        finally:
+            bar.close()
+        self._record()
+        self.save()
+
+    def save(self) -> Path:
+        """Write a checkpoint of everything."""
+        self.progress.last_save = self.progress.frames
+        return self.checkpoint.save(self.progress.frames, {"episodes": self.progress.episodes})
+
+    def _take(self, data: TensorDictBase) -> None:
+        """Store a batch, make the updates it entitles to, and tell who waits for episodes."""
+        progress = self.progress
+        finished = self.window.extend(data)
+        progress.frames += data.numel()
+        progress.episodes += finished.shape[0]
+        spent = self.budget.spent(progress.frames, progress.episodes)
+        self.buffer.extend(data.select(*self.stored, strict=False).contiguous().reshape(-1))
+        for hook in self.after_collect:
+            hook(finished, spent)
+        if progress.frames < self.warmup_frames:
+            return
+        with self.clock.phase("learn"):
+            self.learner.schedule(spent)
+            progress.owed += data.numel() * self.updates_per_frame
+            while progress.owed >= 1.0:
+                progress.owed -= 1.0
+                progress.updates += 1
+                self._add(self.learner.update(self.buffer.sample()))
+
+    def _add(self, losses: TensorDictBase) -> None:
+        for key, value in losses.items():
+            if value.numel() == 1:
+                self._sums[key] = self._sums.get(key, 0.0) + value.reshape(())
+        self._count += 1
+
+    def _record(self) -> None:
+        """One row of ``metrics.csv`` (no wall-clock) and one of ``timing.csv``."""
+        progress = self.progress
+        progress.last_record = progress.frames
+        row = {
+            "frames": progress.frames,
+            "episodes": progress.episodes,
+            "updates": progress.updates,
+            **self.window.summary(),
+            **{key: float(value) / max(self._count, 1) for key, value in sorted(self._sums.items())},
+        }
+        for group in self.learner.optimizer.param_groups:
+            row[f"lr_{group['name']}"] = group["lr"]
+        self._sums, self._count = {}, 0
+        self.metrics.write(row)
+        seconds = self.clock.seconds
+        self.timing.write({"frames": progress.frames, "updates": progress.updates, **seconds})
+        for logger in self.loggers:
+            for key, value in row.items():
+                logger.log_scalar(key, value, step=progress.frames)
