@@ -93,9 +93,7 @@ def build_env(
     cfg: DictConfig, scenario: Scenario, num_envs: int, seed: int, *transforms: Transform
 ) -> EnvBase:
     """The configured backend with a scenario; transforms from the inside outwards."""
-    env = make(
-        cfg.env, scenario=scenario, num_envs=num_envs, seed=seed, device=device_of(cfg)
-    )
+    env = make(cfg.env, scenario=scenario, num_envs=num_envs, seed=seed, device=device_of(cfg))
     return TransformedEnv(env, Compose(*transforms)) if transforms else env
 
 
@@ -155,11 +153,18 @@ def build_optimizer(cfg: DictConfig, loss: LossModule) -> torch.optim.Optimizer:
     """Adam with one group each for actor, critics and temperature, and their schedules."""
     groups: dict[str, list[torch.nn.Parameter]] = {"actor": [], "critic": [], "alpha": []}
     for name, parameter in loss.named_parameters():
-        kind = {"actor_network_params": "actor", "log_alpha": "alpha"}.get(name.split(".")[0], "critic")
+        kind = {"actor_network_params": "actor", "log_alpha": "alpha"}.get(
+            name.split(".")[0], "critic"
+        )
         groups[kind].append(parameter)
     return torch.optim.Adam(
         [
-            {"params": parameters, "name": name, "lr": cfg.lr[name][0], "schedule": tuple(cfg.lr[name])}
+            {
+                "params": parameters,
+                "name": name,
+                "lr": cfg.lr[name][0],
+                "schedule": tuple(cfg.lr[name]),
+            }
             for name, parameters in groups.items()
             if parameters
         ],
@@ -187,6 +192,7 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         total_frames=-1,
         init_random_frames=0 if cfg.init else cfg.warmup_frames,
         track_traj_ids=False,
+        auto_register_policy_transforms=False,
     )
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(cfg.buffer_size, device=device_of(cfg)), batch_size=cfg.batch_size

@@ -114,7 +114,9 @@ def latest(run: Path) -> Path:
         raise FileNotFoundError(f"checkpoint: no such file or folder: {run}")
     if Checkpoint.is_checkpoint(run):
         return run
-    path = CheckpointRotation(run / FOLDER, keep_last=1).latest() if (run / FOLDER).exists() else None
+    path = (
+        CheckpointRotation(run / FOLDER, keep_last=1).latest() if (run / FOLDER).exists() else None
+    )
     if path is None:
         raise FileNotFoundError(f"checkpoint: {run} holds no checkpoint (looked in {run / FOLDER})")
     return path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import sys
 from collections.abc import Callable
@@ -12,7 +13,11 @@ from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from saferl.builders import build_trainer
+from saferl.builders import build_env, build_trainer
+from saferl.envs.transforms import SafetyProjector
+from saferl.evaluation import evaluate, write
+from saferl.metrics import table
+from saferl.trainer import Trainer
 
 log = logging.getLogger(__name__)
 CONFIG = "config.yaml"
@@ -50,7 +55,9 @@ def run_config(run: Path) -> DictConfig:
 def train(cfg: DictConfig) -> None:
     """Train, or continue a run, then test the result."""
     if cfg.resume is not None:
-        others = [o for o in HydraConfig.get().overrides.task if not o.startswith(("resume=", "out="))]
+        others = [
+            o for o in HydraConfig.get().overrides.task if not o.startswith(("resume=", "out="))
+        ]
         if others:
             raise ValueError(
                 "resume continues a run as it was configured and takes no other option, "
@@ -68,3 +75,29 @@ def train(cfg: DictConfig) -> None:
         OmegaConf.save(cfg, run / CONFIG)
     log.info("%s on %s, seed %d. Files: %s", cfg.algo_name, cfg.task.task, cfg.seed, run)
     trainer.train()
+    test(cfg, trainer, run)
+
+
+def test(cfg: DictConfig, trainer: Trainer, run: Path) -> None:
+    """Measure what was trained, under the conditions of a test, and report the table."""
+    test_cfg = cfg.evaluation
+    scenario = dataclasses.replace(
+        trainer.collector.env.base_env.scenario,
+        policy_frequency=test_cfg.policy_frequency,
+        route_starts=0.0,
+        standstill=None,
+        reward=dataclasses.replace(
+            trainer.collector.env.base_env.scenario.reward, risk_shaping=False
+        ),
+    )
+    projectors = [t for t in trainer.collector.env.transform if isinstance(t, SafetyProjector)]
+    for projector in projectors:
+        projector.reset_parent()
+    env = build_env(cfg, scenario, min(test_cfg.num_envs, test_cfg.episodes), cfg.seed, *projectors)
+    rows = evaluate(trainer.collector.policy, env, test_cfg.episodes, cfg.seed)
+    figures = write(rows, run / "evaluation", task=cfg.task.task, episodes=test_cfg.episodes)
+    log.info(
+        "\n%s\nFiles: %s",
+        table(figures, f"{cfg.algo_name}: {test_cfg.episodes} test episodes of {cfg.task.task}"),
+        run,
+    )

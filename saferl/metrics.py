@@ -77,6 +77,16 @@ class EpisodeWindow:
         names = ("return", "cost_return", "collision_rate", "success_rate", "frozen_rate")
         return {name: round(mean, 6) for name, mean in zip(names, means, strict=True)}
 
+    def short(self) -> dict[str, str]:
+        """The summary for a progress bar."""
+        figures = self.summary()
+        return {
+            "return": f"{figures['return']:.1f}",
+            "cost": f"{figures['cost_return']:.3f}",
+            "CR": f"{figures['collision_rate']:.0%}",
+            "SR": f"{figures['success_rate']:.0%}",
+        }
+
     def state_dict(self) -> dict[str, torch.Tensor]:
         return {"values": self.values}
 

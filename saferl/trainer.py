@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -75,6 +76,9 @@ class Learner:
         self.loss, self.optimizer, self.target_updater = loss, optimizer, target_updater
         self.after_update = after_update or []
         self._forward = torch.compile(loss) if compile else loss
+        if compile:
+            log.info("Compiling the loss at its first update: this takes about a minute.")
+            warnings.filterwarnings("ignore", category=UserWarning, module="tensordict|torch._dynamo")
 
     def schedule(self, spent: float) -> None:
         """Set the learning rates for a fraction of the budget."""
@@ -169,7 +173,12 @@ class Trainer:
     checkpointed: dict = field(default_factory=dict)
 
     def __post_init__(self):
-        for name, least in (("updates_per_frame", 0), ("warmup_frames", 1), ("record_every", 1), ("save_every", 1)):
+        for name, least in (
+            ("updates_per_frame", 0),
+            ("warmup_frames", 1),
+            ("record_every", 1),
+            ("save_every", 1),
+        ):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be >= {least}, got {getattr(self, name)}.")
         self.progress, self.clock = Progress(), Clock()
@@ -223,7 +232,7 @@ class Trainer:
                 bar.update((progress.episodes if self.budget.episodes else progress.frames) - bar.n)
                 if progress.frames - progress.last_record >= self.record_every:
                     self._record()
-                    bar.set_postfix(self.window.summary())
+                    bar.set_postfix(self.window.short())
                 if progress.frames - progress.last_save >= self.save_every:
                     self.save()
         except KeyboardInterrupt:
@@ -275,7 +284,9 @@ class Trainer:
             "episodes": progress.episodes,
             "updates": progress.updates,
             **self.window.summary(),
-            **{key: float(value) / max(self._count, 1) for key, value in sorted(self._sums.items())},
+            **{
+                key: float(value) / max(self._count, 1) for key, value in sorted(self._sums.items())
+            },
         }
         for group in self.learner.optimizer.param_groups:
             row[f"lr_{group['name']}"] = group["lr"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
@@ -35,7 +36,7 @@ class GaussianHead(nn.Module):
         super().__init__()
         self.encoder = encoder
         self.head = nn.Linear(width, 2 * action_dim)
-        self.extract = NormalParamExtractor(scale_lb=scale_lb)
+        self.extract = NormalParamExtractor(scale_lb=scale_lb)  # pyright: ignore[reportArgumentType]
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         return self.extract(self.head(self.encoder(*inputs)))
@@ -76,7 +77,7 @@ def tanh_gaussian_actor(
         (torch.Size([5, 2]), torch.Size([5]))
     """
     if spec is None:
-        spec = Bounded(low=-1.0, high=1.0, shape=(action_dim,))
+        spec = Bounded(low=-1.0, high=1.0, shape=torch.Size((action_dim,)))
     head = GaussianHead(encoder, width, action_dim, scale_lb)
     return ProbabilisticActor(
         TensorDictModule(head, in_keys=list(in_keys), out_keys=["loc", "scale"]),

@@ -102,6 +102,11 @@ class CriticEnsemble(TensorDictModuleBase):
         True
     """
 
+    params: TensorDictParams
+    template: TensorDictModuleBase
+    in_keys: list[NestedKey]
+    out_keys: list[NestedKey]
+
     def __init__(
         self,
         members: Sequence[TensorDictModuleBase] | TensorDictModuleBase,
@@ -113,7 +118,7 @@ class CriticEnsemble(TensorDictModuleBase):
         super().__init__()
         if reduce not in _REDUCTIONS:
             raise ValueError(f"reduce must be one of {sorted(_REDUCTIONS)}, got {reduce!r}.")
-        if isinstance(members, nn.Module) and not isinstance(members, nn.ModuleList):
+        if isinstance(members, TensorDictModuleBase):
             if params is None:
                 raise ValueError("A template critic needs its stacked params; else pass a list.")
             template = members
@@ -128,7 +133,7 @@ class CriticEnsemble(TensorDictModuleBase):
                 )
             template = members[0]
             for member in members[1:]:
-                theirs, ours = (m.in_keys + m.out_keys for m in (member, template))
+                theirs, ours = ([*m.in_keys, *m.out_keys] for m in (member, template))
                 if theirs != ours:
                     raise ValueError(
                         f"All critics must use the same keys, got {ours} and {theirs}."
@@ -165,7 +170,8 @@ class CriticEnsemble(TensorDictModuleBase):
         Reads the members' ``in_keys`` but for the action.
         """
         network = getattr(self.template, "module", None)
-        if self.in_keys[-1] != self.action_key or not hasattr(network, "condition"):
+        condition = getattr(network, "condition", None)
+        if self.in_keys[-1] != self.action_key or condition is None:
             scene = tensordict.select(*(key for key in self.in_keys if key != self.action_key))
             return lambda action: self(scene.copy().set(self.action_key, action)).get(
                 self.out_keys[0]
@@ -174,6 +180,6 @@ class CriticEnsemble(TensorDictModuleBase):
         members = []
         for params in self.params.data.unbind(0):
             with params.to_module(self.template, preserve_module_state=False):
-                members.append(network.condition(*scene))
+                members.append(condition(*scene))
         reduce = _REDUCTIONS[self.reduce]
         return lambda action: reduce(torch.stack([member(action) for member in members]))

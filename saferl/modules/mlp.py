@@ -14,6 +14,9 @@ from saferl.modules.mmam import EGO_SCALE, VEHICLE_SCALE, feature_scale, scale_v
 class _FlatScene(nn.Module):
     """Scaled ego features and all vehicle rows in one vector [*B, 9 + 6 rows]."""
 
+    ego_scale: Tensor
+    vehicle_scale: Tensor
+
     def __init__(self, rows: int, ego_scale: Sequence[float], vehicle_scale: Sequence[float]):
         super().__init__()
         self.rows = rows
@@ -135,7 +138,8 @@ class MLPValue(nn.Module):
         """
         on_scene, on_action = self.first.weight.tensor_split([self.scene.size], dim=-1)
         scene = F.linear(self.scene(ego, vehicles), on_scene, self.first.bias)
-        weights = [(layer.weight, layer.bias) for layer in self.layers]
+        linear = [layer for layer in self.layers if isinstance(layer, nn.Linear)]
+        weights = [(layer.weight, layer.bias) for layer in linear]
         activation = self.activation
 
         def value(action: Tensor) -> Tensor:

@@ -31,15 +31,33 @@ def scale_vehicles(vehicles: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(present.unsqueeze(-1), vehicles / scale, 0.0), present
 
 
+def _linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """``F.linear`` of [*B, F] as of [N, F].
+
+    With stacked weights, vmap turns a linear map of three or more dimensions into a product with
+    one copy of the weights for each scene, which is several times slower.
+    """
+    out = F.linear(x.reshape(-1, x.shape[-1]), weight, bias)
+    return out.reshape(*x.shape[:-1], out.shape[-1])
+
+
+class _Linear(nn.Linear):
+    def forward(self, input: Tensor) -> Tensor:
+        return _linear(input, self.weight, self.bias)
+
+
 class _SceneTokens(nn.Module):
     """Embeds the EV and the SVs apart (linear + GELU): tokens [*B, 1 + M, d] and presence."""
+
+    ego_scale: Tensor
+    vehicle_scale: Tensor
 
     def __init__(self, width: int, ego_scale: Sequence[float], vehicle_scale: Sequence[float]):
         super().__init__()
         self.register_buffer("ego_scale", feature_scale("ego_scale", ego_scale))
         self.register_buffer("vehicle_scale", feature_scale("vehicle_scale", vehicle_scale))
-        self.ego = nn.Linear(len(ego_scale), width)
-        self.vehicle = nn.Linear(len(vehicle_scale), width)
+        self.ego = _Linear(len(ego_scale), width)
+        self.vehicle = _Linear(len(vehicle_scale), width)
 
     def forward(self, ego: Tensor, vehicles: Tensor) -> tuple[Tensor, Tensor]:
         features, present = scale_vehicles(vehicles, self.vehicle_scale)
@@ -60,7 +78,7 @@ class _Attention(nn.Module):
             raise ValueError(f"scale must be 'paper' or 'per_head', got {scale!r}.")
         self.heads = heads
         self.divisor = math.sqrt(width if scale == "paper" else width // heads)
-        self.merge = nn.Linear(width, width, bias=False)
+        self.merge = _Linear(width, width, bias=False)
 
 
 class _SelfAttention(_Attention):
@@ -68,7 +86,7 @@ class _SelfAttention(_Attention):
 
     def __init__(self, width: int, heads: int, scale: str):
         super().__init__(width, heads, scale)
-        self.query_key_value = nn.Linear(width, 3 * width, bias=False)
+        self.query_key_value = _Linear(width, 3 * width, bias=False)
 
     def forward(self, tokens: Tensor, present: Tensor) -> Tensor:
         split = self.query_key_value(tokens).unflatten(-1, (3, self.heads, -1))
@@ -88,9 +106,9 @@ class _EgoAttention(_Attention):
 
     def __init__(self, width: int, heads: int, scale: str):
         super().__init__(width, heads, scale)
-        self.query = nn.Linear(width, width, bias=False)
-        self.key = nn.Linear(width, width, bias=False)
-        self.value = nn.Linear(width, width, bias=False)
+        self.query = _Linear(width, width, bias=False)
+        self.key = _Linear(width, width, bias=False)
+        self.value = _Linear(width, width, bias=False)
 
     def folded_query(self, row: Tensor) -> Tensor:
         """W_K^T q / divisor of each head: row [*B, d] -> [*B, h, d]."""
@@ -107,7 +125,8 @@ class _EgoAttention(_Attention):
         logits = self.folded_query(row) @ tokens.mT
         weights = logits.masked_fill(~present.unsqueeze(-2), _MASKED).softmax(-1)
         weight = self.value.weight.unflatten(0, (self.heads, -1))
-        return self.merge(torch.einsum("...hd,hkd->...hk", weights @ tokens, weight).flatten(-2))
+        heads = torch.einsum("...hd,hkd->...hk", weights @ tokens, weight)
+        return self.merge(heads.flatten(-2))
 
 
 class MMAMPolicyEncoder(nn.Module):
@@ -211,12 +230,12 @@ class MMAMValue(nn.Module):
         super().__init__()
         pair_width = width // 4 if pair_width is None else pair_width
         self.tokens = _SceneTokens(width, ego_scale, vehicle_scale)
-        self.action = nn.Linear(action_dim, width)
+        self.action = _Linear(action_dim, width)
         self.attention = _EgoAttention(width, heads, scale)
-        self.pair = nn.Linear(3 * width, pair_width)  # on (SV, EV, action)
-        self.joint = nn.Linear(2 * width + pair_width, width)  # on (EV, action, pooled pairs)
-        self.w_attn = nn.Linear(width, 1, bias=False)
-        self.w_mlp = nn.Linear(width, 1, bias=False)
+        self.pair = _Linear(3 * width, pair_width)  # on (SV, EV, action)
+        self.joint = _Linear(2 * width + pair_width, width)  # on (EV, action, pooled pairs)
+        self.w_attn = _Linear(width, 1, bias=False)
+        self.w_mlp = _Linear(width, 1, bias=False)
 
     def condition(self, ego: Tensor, vehicles: Tensor) -> Callable[[Tensor], Tensor]:
         """The value as a function of the action alone, [*B, A] -> [*B, 1], in this scene.
@@ -229,33 +248,31 @@ class MMAMValue(nn.Module):
         query = self.attention.folded_query(ego_token)
         readout = self.attention.folded_value(self.w_attn.weight.squeeze(0))
         logits = (query @ tokens.mT).masked_fill(~present.unsqueeze(-2), _MASKED)
-        readings = (tokens @ readout.mT).mT
+        readings = _linear(tokens, readout).mT
 
         # A layer on concatenated tokens is a sum of one product for each of them.
         width = ego_token.shape[-1]
         on_vehicle, on_ego, pair_on_action = self.pair.weight.split(width, dim=-1)
-        pair_scene = F.linear(vehicle_tokens, on_vehicle, self.pair.bias)
-        pair_scene = pair_scene + F.linear(ego_token, on_ego).unsqueeze(-2)
+        pair_scene = _linear(vehicle_tokens, on_vehicle, self.pair.bias)
+        pair_scene = pair_scene + _linear(ego_token, on_ego).unsqueeze(-2)
         on_ego, joint_on_action, joint_on_pairs = self.joint.weight.split(
             [width, width, self.pair.out_features], dim=-1
         )
-        joint_scene = F.linear(ego_token, on_ego, self.joint.bias)
+        joint_scene = _linear(ego_token, on_ego, self.joint.bias)
         share = present[..., 1:, None].to(tokens.dtype)
         share = share / share.sum(-2, keepdim=True).clamp(min=1.0)
         action_weight, action_bias, w_mlp = self.action.weight, self.action.bias, self.w_mlp.weight
 
         def value(action: Tensor) -> Tensor:
-            token = F.gelu(F.linear(action, action_weight, action_bias))
+            token = F.gelu(_linear(action, action_weight, action_bias))
             logit = (query @ token.unsqueeze(-1)).squeeze(-1)
             weights = torch.cat([logits, logit.unsqueeze(-1)], dim=-1).softmax(-1)
             y_attn = (weights[..., :-1] * readings).sum((-2, -1))
-            y_attn = y_attn + (weights[..., -1] * (token @ readout.mT)).sum(-1)
-            pairs = F.gelu(pair_scene + F.linear(token, pair_on_action).unsqueeze(-2))
+            y_attn = y_attn + (weights[..., -1] * _linear(token, readout)).sum(-1)
+            pairs = F.gelu(pair_scene + _linear(token, pair_on_action).unsqueeze(-2))
             pooled = (pairs * share).sum(-2)
-            y_mlp = (
-                joint_scene + F.linear(token, joint_on_action) + F.linear(pooled, joint_on_pairs)
-            )
-            return y_attn.unsqueeze(-1) + F.linear(F.gelu(y_mlp), w_mlp)
+            y_mlp = joint_scene + _linear(token, joint_on_action) + _linear(pooled, joint_on_pairs)
+            return y_attn.unsqueeze(-1) + _linear(F.gelu(y_mlp), w_mlp)
 
         return value
 

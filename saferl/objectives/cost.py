@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from copy import deepcopy
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase, TensorDictParams, unravel_key
@@ -12,7 +13,6 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import _cache_values, _vmap_func, distance_loss
-from torchrl.objectives.value import ValueEstimatorBase
 
 from saferl.modules import CriticEnsemble, LagrangeMultiplier
 
@@ -41,6 +41,15 @@ class CostCriticLoss(LossModule):
     lagrange: LagrangeMultiplier
     cost_limit: Tensor
 
+    # Of the loss beside this base, or made late.
+    tensor_keys: Any
+    actor_network: TensorDictModule
+    qvalue_network: TensorDictModule
+    deactivate_vmap: bool
+    _value_estimator: Any
+    _cost_value_estimator: Any
+    _vmap_cost_criticN0: Any
+
     def _add_cost_critic(
         self,
         cost_critic: TensorDictModule | list[TensorDictModule],
@@ -57,7 +66,7 @@ class CostCriticLoss(LossModule):
             raise ValueError(f"num_cost_critics must be >= 1, got {num_cost_critics}.")
         self.num_cost_critics = num_cost_critics
         self.convert_to_functional(
-            cost_critic,
+            cost_critic,  # pyright: ignore[reportArgumentType]
             "cost_critic",
             num_cost_critics,
             create_target_params=create_target_params,
@@ -84,13 +93,14 @@ class CostCriticLoss(LossModule):
 
     def make_value_estimator(
         self,
-        value_type: ValueEstimators | ValueEstimatorBase | type | None = None,
+        value_type: Any = None,
         **hyperparams,
     ) -> None:
         """Build the value estimators of the reward and of the cost, alike.
 
         Args:
-            value_type (optional): as in TorchRL's losses. Defaults to TD(0).
+            value_type (ValueEstimators, ValueEstimatorBase or type, optional): as in
+                TorchRL's losses. Defaults to TD(0).
             **hyperparams: of the estimator, such as ``gamma``.
 
         Raises:
@@ -175,7 +185,7 @@ class CostCriticLoss(LossModule):
         if tensordict.get(("next", self.tensor_keys.cost), None) is None:
             raise KeyError(
                 f"The batch has no entry {('next', self.tensor_keys.cost)}; under 'next' it has "
-                f"{sorted(map(str, tensordict['next'].keys()))}. "
+                f"{sorted(map(str, tensordict.get('next').keys()))}. "
                 "Name your cost with loss.set_keys(cost=...)."
             )
         next_state, _ = next_sample or self._sample_next(tensordict)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -136,6 +137,9 @@ class SACLagLoss(CostCriticLoss, SACLoss):
 
     default_keys = _AcceptedKeys
 
+    log_alpha: Tensor
+    _vmap_qnetworkN0: Callable[..., TensorDictBase]
+
     def __init__(
         self,
         actor_network: ProbabilisticTensorDictSequential,
@@ -192,7 +196,7 @@ class SACLagLoss(CostCriticLoss, SACLoss):
         if self.reduction != "none" or self.scalar_output_mode == "non_tensor":
             self.out_keys += _SCALARS
 
-    @dispatch
+    @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         next_sample = self._sample_next(tensordict)
         loss_qvalue, metadata = self.qvalue_v2_loss(tensordict, next_sample)
@@ -280,7 +284,8 @@ class SACLagLoss(CostCriticLoss, SACLoss):
 
     def _alpha_loss(self, log_prob: Tensor) -> Tensor:
         """E14, unreduced ``[*B]``; the parent class weighs with ``log_alpha`` instead."""
-        return -self.log_alpha.exp() * (log_prob + self.target_entropy)
+        target = self.target_entropy  # a tensor, since the constructor asked for it
+        return -self.log_alpha.exp() * (log_prob + target)  # pyright: ignore[reportOperatorIssue]
 
     def _qvalues(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
         inputs = tensordict.select(*self.qvalue_network.in_keys)

@@ -231,7 +231,7 @@ def test_adding_one_transition():
 
 def test_no_executed_action_names_the_key():
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), transform=ExecutedAction())
-    with pytest.raises(KeyError, match="action_executed.*felt.*Append a SafetyProjector"):
+    with pytest.raises(KeyError, match=r"action_executed.*felt.*Append a SafetyProjector"):
         buffer.extend(EchoEnv().rollout(3))
 
 

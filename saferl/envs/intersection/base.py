@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -16,6 +17,7 @@ from saferl.envs.intersection.observation import ROWS
 from saferl.envs.intersection.reward import Reward
 
 SUBSTEPS = 3
+STANDING = 0.3  # m/s, slower counts as standing still
 OUTCOMES = ("collision", "offroad", "success")
 
 
@@ -31,6 +33,9 @@ class Scenario:
         duration: seconds until ``truncated``.
         route_starts: fraction of the starts drawn uniformly along the route instead of 40 m before
             the box (training only).
+        standstill: seconds after which a car that stands still is ``truncated`` (training only, ours):
+            learners bootstrap through it, so that the task is the same and fewer of the stored frames
+            show a parked car. None: never.
         reward, cost: see :class:`Reward` and :class:`CollisionCost`.
 
     >>> Scenario(task="uturn")
@@ -45,6 +50,7 @@ class Scenario:
     policy_frequency: int = 5
     duration: float = 25.0
     route_starts: float = 0.0
+    standstill: float | None = None
     reward: Reward = field(default_factory=Reward)
     cost: CollisionCost = field(default_factory=CollisionCost)
 
@@ -61,6 +67,14 @@ class Scenario:
             raise ValueError(f"duration must be > 0 seconds, got {self.duration}.")
         if not 0.0 <= self.route_starts <= 1.0:
             raise ValueError(f"route_starts must be in [0, 1], got {self.route_starts}.")
+
+        if self.standstill is not None and self.standstill <= 0:
+            raise ValueError(f"standstill must be null or > 0 seconds, got {self.standstill}.")
+
+    @property
+    def patience(self) -> float:
+        """Decisions in a row that a car may stand still."""
+        return float("inf") if self.standstill is None else self.standstill * self.policy_frequency
 
     @property
     def horizon(self) -> int:
@@ -95,6 +109,11 @@ def mix(seed: Tensor, stream: int | Tensor) -> Tensor:
 def uniform(seed: Tensor, stream: int) -> Tensor:
     """A number in [0, 1), float64 [...], from int64 seeds [...] and a stream number."""
     return _shift(mix(seed, stream), 11).to(torch.float64) * 2.0**-53
+
+
+def episode_seeds(seed: int, count: int) -> Tensor:
+    """Seeds [count] of the episodes of a test with this seed."""
+    return mix(torch.arange(count, dtype=torch.int64), seed) & _U31
 
 
 class IntersectionBase(EnvBase):
@@ -161,3 +180,11 @@ class IntersectionBase(EnvBase):
             for key, value in values.items()
         }
         return TensorDict(out, batch_size=self.batch_size, device=self.device)
+
+    def snapshot(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """States of the ego [6] and of the others [N, 6] of one environment, float64."""
+        raise NotImplementedError
+
+    def render(self, index: int) -> np.ndarray | None:
+        """A picture [H, W, 3] uint8 of one environment, or None where a backend draws none."""
+        return None

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from saferl.envs.intersection.base import SUBSTEPS, IntersectionBase, Scenario, uniform
+from saferl.envs.intersection.base import STANDING, SUBSTEPS, IntersectionBase, Scenario, uniform
 from saferl.envs.intersection.dynamics import step_ego, to_physical
 from saferl.envs.intersection.geometry import (
     ARM,
+    EXIT_DISTANCE,
     ROUTES_OF_TASK,
     arrived,
     line_pose,
@@ -29,11 +31,11 @@ def draw_route(task: str, seed: Tensor) -> Tensor:
 
 def draw_start(route: Tensor, seed: Tensor, route_starts: float) -> Tensor:
     """Start states [..., 6] float64: 40 +- 5 m before the box at U[6, 10] m/s, or, for the share
-    ``route_starts`` of the seeds, anywhere between there and 15 m past the box."""
+    ``route_starts`` of the seeds, anywhere between there and the goal."""
     anywhere = uniform(seed, 2) < route_starts
     before = ARM - 40.0 + 10.0 * (uniform(seed, 3) - 0.5)
     lines = reference_lines(route, before)[..., 0, :, :]
-    past = lines[..., 3, 5] + 15.0
+    past = lines[..., 3, 5] + EXIT_DISTANCE
     first = ARM - 45.0
     s = torch.where(anywhere, first + (past - first) * uniform(seed, 3), before)
     x, y, phi = line_pose(lines, s).unbind(-1)
@@ -82,6 +84,7 @@ class BatchedIntersection(IntersectionBase):
             "ego": draw_start(route, seeds, self.scenario.route_starts).float(),
             "control": torch.zeros(*self.batch_size, 2, device=self.device),
             "steps": torch.zeros(self.batch_size, dtype=torch.int64, device=self.device),
+            "still": torch.zeros(self.batch_size, dtype=torch.int64, device=self.device),
             "route": route,
         }
         old = self._state or fresh
@@ -102,7 +105,12 @@ class BatchedIntersection(IntersectionBase):
         ego = state["ego"]
         for _ in range(SUBSTEPS):
             ego = step_ego(ego, control, scenario.dt)
-        self._state = state | {"ego": ego, "control": control, "steps": state["steps"] + 1}
+        self._state = state | {
+            "ego": ego,
+            "control": control,
+            "steps": state["steps"] + 1,
+            "still": torch.where(ego[:, 2] < STANDING, state["still"] + 1, 0),
+        }
         observation, observed = self._observe()
         off = offroad(ego)
         collision = torch.zeros_like(off)
@@ -114,6 +122,7 @@ class BatchedIntersection(IntersectionBase):
         )  # fmt: skip
         terminated = off | collision | success
         truncated = self._state["steps"] >= scenario.horizon
+        truncated = truncated | (self._state["still"] >= scenario.patience)
         return self._output(
             observation
             | {
@@ -127,6 +136,10 @@ class BatchedIntersection(IntersectionBase):
                 "done": terminated | truncated,
             }
         )
+
+    def snapshot(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        states = self._state["ego"][index], self._vehicles[index][self._present[index]]
+        return tuple(state.double().cpu().numpy() for state in states)
 
     def state_dict(self, *args, **kwargs) -> dict[str, Tensor]:
         """Everything that decides what comes next: vehicle states and episode sequences."""

@@ -70,5 +70,7 @@ class CollisionCost:
             pose = torch.stack([vehicles[..., 0], vehicles[..., 1], vehicles[..., 4]], -1)
             hits.append((overlap(ego_pose, pose, scale=scale) & observed).sum(-1))
         count = torch.stack(hits, -1).to(ego.dtype)
-        total = self.initial * speed / self.base_speed * (count * torch.exp(-self.decay * beta)).sum(-1)
+        total = (
+            self.initial * speed / self.base_speed * (count * torch.exp(-self.decay * beta)).sum(-1)
+        )
         return total / observed.sum(-1).clamp_min(1)

@@ -100,13 +100,17 @@ class CautiousDriver(Driver):
         reach = ((choice[..., None] - v) / rate).clamp_min(0.0)
         within = torch.minimum(times, reach)
         ahead = v * within + rate * within.square() / 2 + choice[..., None] * (times - within)
-        pose = line_pose(line[..., None, None, :, :].expand(*ahead.shape, 4, 6), s[..., None, None] + ahead)
+        pose = line_pose(
+            line[..., None, None, :, :].expand(*ahead.shape, 4, 6), s[..., None, None] + ahead
+        )
         world = _world_velocity(ego)
         speed = vehicles[..., 3:5] + world[..., None, :]
         start = vehicles[..., 1:3] + ego[..., None, 1:3]
         moved = start[..., None, :] + speed[..., None, :] * times[:, None]  # [*B, M, T, 2]
         heading = vehicles[..., None, 5:6].expand(*moved.shape[:-1], 1)
-        other = torch.cat([moved, heading], -1).transpose(-3, -2)[..., None, :, :, :]  # [*B, 1, T, M, 3]
+        other = torch.cat([moved, heading], -1).transpose(-3, -2)[
+            ..., None, :, :, :
+        ]  # [*B, 1, T, M, 3]
         hit = overlap(pose[..., None, :], other, scale=self.margin)
         hit &= vehicles[..., None, None, :, 0] > 0.5
         free_choice = ~hit.flatten(-2).any(-1)
@@ -115,7 +119,9 @@ class CautiousDriver(Driver):
 
 def _world_velocity(ego: Tensor) -> Tensor:
     cos, sin = torch.cos(ego[..., 5]), torch.sin(ego[..., 5])
-    return torch.stack([ego[..., 3] * cos - ego[..., 4] * sin, ego[..., 3] * sin + ego[..., 4] * cos], -1)
+    return torch.stack(
+        [ego[..., 3] * cos - ego[..., 4] * sin, ego[..., 3] * sin + ego[..., 4] * cos], -1
+    )
 
 
 class RandomDriver(Driver):

@@ -163,7 +163,9 @@ def project(position: Tensor, lines: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     s = torch.where(bent, angle / k.abs(), along)
     s = torch.minimum(s.clamp_min(0.0), length)
     poses = _advance(lines, s)
-    gap = torch.hypot(position[..., None, 0] - poses[..., 0], position[..., None, 1] - poses[..., 1])
+    gap = torch.hypot(
+        position[..., None, 0] - poses[..., 0], position[..., None, 1] - poses[..., 1]
+    )
     distance, index = gap.min(-1)
     pose = poses.gather(-2, index[..., None, None].expand(*index.shape, 1, 3)).squeeze(-2)
     return pose, (s + start).gather(-1, index[..., None]).squeeze(-1), distance

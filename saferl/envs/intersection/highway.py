@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-from saferl.envs.intersection.base import SUBSTEPS, Scenario
+from saferl.envs.intersection.base import STANDING, SUBSTEPS, Scenario
 from saferl.envs.intersection.batched import draw_route, draw_start
 from saferl.envs.intersection.cost import CollisionCost
 from saferl.envs.intersection.dynamics import to_physical
@@ -50,7 +50,7 @@ class IntersectionEnv(gymnasium.Env):
     in :data:`ROUTES`) and ``start`` (the ego's state [6]).
 
     Args:
-        task, vehicles, rows, policy_frequency, duration, route_starts: see :class:`Scenario`.
+        task, vehicles, rows, policy_frequency, duration, route_starts, standstill: see :class:`Scenario`.
         reward: a :class:`Reward` or its fields, e.g. ``{"reading": "raw", "risk_shaping": True}``.
         cost: a :class:`CollisionCost` or its fields.
         render_mode: None or ``rgb_array``.
@@ -71,13 +71,14 @@ class IntersectionEnv(gymnasium.Env):
         policy_frequency: int = 5,
         duration: float = 25.0,
         route_starts: float = 0.0,
+        standstill: float | None = None,
         reward: Reward | Mapping[str, Any] | None = None,
         cost: CollisionCost | Mapping[str, Any] | None = None,
         render_mode: str | None = None,
     ):
         self.scenario = Scenario(
             task=task, vehicles=vehicles, rows=rows, policy_frequency=policy_frequency,
-            duration=duration, route_starts=route_starts, reward=_build("reward", Reward, reward),
+            duration=duration, route_starts=route_starts, standstill=standstill, reward=_build("reward", Reward, reward),
             cost=_build("cost", CollisionCost, cost),
         )  # fmt: skip
         modes = self.metadata["render_modes"]
@@ -130,7 +131,8 @@ class IntersectionEnv(gymnasium.Env):
         unknown = set(options) - {"task", "route", "start"}
         if unknown:
             raise ValueError(f"options must be among task, route, start, got {sorted(unknown)}.")
-        draw = torch.tensor(int(self.np_random.integers(2**31)))
+        # A given seed decides route and start by itself, so that both backends start alike.
+        draw = torch.tensor(int(self.np_random.integers(2**31)) if seed is None else seed)
         self._route = self._choose_route(options, draw)
         start = options.get("start")
         if start is None:
@@ -144,7 +146,7 @@ class IntersectionEnv(gymnasium.Env):
         ego = EgoVehicle(self.road, start, int(self._route))
         traffic = draw_traffic(self.np_random, self.road.table, self.scenario.vehicles, ego)
         self.road.populate(ego, *traffic)
-        self._steps, self._control = 0, None
+        self._steps, self._still, self._control = 0, 0, None
         return self._observe(), self._info(0.0, False, False, False)
 
     def _observe(self) -> dict[str, np.ndarray]:
@@ -196,7 +198,8 @@ class IntersectionEnv(gymnasium.Env):
             self._observed.any(), torch.tensor(collision or off), torch.tensor(success),
         )  # fmt: skip
         terminated = collision or off or success
-        truncated = self._steps >= scenario.horizon
+        self._still = self._still + 1 if ego.state[2] < STANDING else 0
+        truncated = self._steps >= scenario.horizon or self._still >= scenario.patience
         info = self._info(cost, collision, off, success)
         return observation, float(reward), terminated, truncated, info
 

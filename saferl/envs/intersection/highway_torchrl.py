@@ -35,7 +35,7 @@ class HighwayIntersection(IntersectionBase):
     def __init__(self, scenario: Scenario, num_envs: int = 1, seed: int = 0, device=None):
         super().__init__(scenario, num_envs, seed, device)
         settings = {f.name: getattr(scenario, f.name) for f in dataclasses.fields(scenario)}
-        self.envs = [IntersectionEnv(**settings) for _ in range(num_envs)]
+        self.envs = [IntersectionEnv(**settings, render_mode="rgb_array") for _ in range(num_envs)]
         self._seeds = torch.zeros(num_envs, dtype=torch.int64)
         self._actions: list[list[np.ndarray]] = [[] for _ in range(num_envs)]
         self._last: list[dict] = [{} for _ in range(num_envs)]
@@ -74,7 +74,9 @@ class HighwayIntersection(IntersectionBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         reset = self._reset_mask(tensordict)
-        self._seeds = torch.where(reset, self._next_seeds(tensordict, reset), self._seeds.to(reset.device)).cpu()
+        self._seeds = torch.where(
+            reset, self._next_seeds(tensordict, reset), self._seeds.to(reset.device)
+        ).cpu()
         for index in reset.nonzero().flatten().tolist():
             self._reset_one(index)
         return self._stack(("ego", "vehicles", "route", *OUTCOMES))
@@ -84,6 +86,12 @@ class HighwayIntersection(IntersectionBase):
             self._step_one(index, action.copy())
         ends = ("reward", "cost", "terminated", "truncated", "done")
         return self._stack(("ego", "vehicles", "route", *OUTCOMES, *ends))
+
+    def snapshot(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        return self.envs[index].snapshot()
+
+    def render(self, index: int) -> np.ndarray | None:
+        return self.envs[index].render()
 
     def state_dict(self, *args, **kwargs) -> dict[str, Tensor]:
         """Seeds, and the actions of the running episodes: an episode follows from these."""

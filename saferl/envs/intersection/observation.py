@@ -75,8 +75,10 @@ def observe(
         [
             torch.ones_like(distance)[..., None],
             delta,
-            (vehicles[..., 2] * v_cos - vehicles[..., 3] * v_sin)[..., None] - world_v[..., None, :1],
-            (vehicles[..., 2] * v_sin + vehicles[..., 3] * v_cos)[..., None] - world_v[..., None, 1:],
+            (vehicles[..., 2] * v_cos - vehicles[..., 3] * v_sin)[..., None]
+            - world_v[..., None, :1],
+            (vehicles[..., 2] * v_sin + vehicles[..., 3] * v_cos)[..., None]
+            - world_v[..., None, 1:],
             (torch.remainder(vehicles[..., 4:5] + 0.75 * math.pi, 2 * math.pi) - 0.75 * math.pi),
         ],
         -1,

@@ -24,7 +24,8 @@ COMMIT = 5.0  # m/s^2; a vehicle that could not stop with it before the box has 
 STOP = ARM - LENGTH / 2 - 1.0  # m, where a yielding vehicle's centre stops
 TIME_MARGIN = 0.5  # s between two vehicles in the zone where their routes cross
 CORRIDOR = WIDTH / 2 + 0.3  # m to either side of the route that must be free of bodies
-BODY_GAP = 2.0  # m kept from a body across the corridor
+BODY_GAP = 3.0  # m kept from a body across the corridor
+EGO_ROOM = 2.0  # m more for the ego, which keeps to no line
 _BODY = np.array([(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.5)]) * (LENGTH, WIDTH)
 
 
@@ -98,7 +99,11 @@ class IntersectionRoad(RegulatedRoad):
         route, s, speed = self.route, self.s, self.speed
         if self.ego is not None:
             e_route, e_s, e_lateral, e_speed = self._ego_on_route()
-            route, s, speed = np.append(route, e_route), np.append(s, e_s), np.append(speed, e_speed)
+            route, s, speed = (
+                np.append(route, e_route),
+                np.append(s, e_s),
+                np.append(speed, e_speed),
+            )
             held = np.append(self.held, False)
         else:
             held = self.held
@@ -115,6 +120,9 @@ class IntersectionRoad(RegulatedRoad):
         arrival = np.minimum(np.maximum(to_line, 0) / np.maximum(speed, 1.0), 900.0)
         rank = table.priority[route] * 1e3 - arrival
         rank = np.where(inside, 1e6 - np.where(inside, entered, 0.0), rank)
+        import os
+        if os.environ.get("VAR") and speed[-1] > 1.0:
+            rank[-1] = table.priority[route[-1]] * 1e3 - arrival[-1]
         rank = rank + s * 1e-6 - np.arange(total) * 1e-9
 
         # The first vehicle on each approach lane that has not entered.
@@ -143,7 +151,8 @@ class IntersectionRoad(RegulatedRoad):
                 new_held[i] = blocked[i] or (meet[i] & free & (rank > rank[i])).any()
                 free[i] = not new_held[i]
         self.held = new_held
-        self.stop = np.where(new_held, STOP, self._stops_in_box(route, s, rank, inside, clash))
+        stop = self._stops_in_box(route, s, rank, inside, clash, meet)
+        self.stop = np.where(new_held, STOP, stop)
         for vehicle, yields in zip(self.traffic, self.held, strict=True):
             vehicle.is_yielding = bool(yields)
 
@@ -162,17 +171,20 @@ class IntersectionRoad(RegulatedRoad):
             other_end = (other[..., 1] - s) / pace
         return crossing & (begin < other_end + TIME_MARGIN) & (other_begin < end + TIME_MARGIN)
 
-    def _stops_in_box(self, route, s, rank, inside, clash) -> np.ndarray:
+    def _stops_in_box(self, route, s, rank, inside, clash, meet) -> np.ndarray:
         """[N] arc length before which a vehicle that has entered must stop for an earlier one."""
-        count = len(self.s)
-        if not count:
-            return np.zeros(0)
-        route, s, rank, inside = route[:count], s[:count], rank[:count], inside[:count]
-        begin = self.table.zone[route[:, None], route][..., 0]
-        within = s[:, None] >= begin
-        behind = ~within & (within.T | (rank > rank[:, None]))
-        wait = clash & behind & inside & inside[:, None]
-        return np.where(wait, begin - 0.5, np.inf).min(1)
+        count = len(clash)
+        begin = self.table.zone[route[:count, None], route][..., 0]  # [N, total]
+        within = s[:count, None] >= begin
+        wait = np.zeros(begin.shape, bool)
+        wait[:, :count] = clash & within[:, :count].T
+        later = rank > rank[:count, None]
+        wait[:, :count] |= clash & later[:, :count]
+        # The ego keeps to no zone: wait for it only where it is predicted to be.
+        wait[:, count:] = meet[:count, count:] & later[:, count:]
+        wait &= ~within & inside & inside[:count, None]
+        begin[:, count:] -= EGO_ROOM
+        return np.where(wait, begin - 0.5, np.inf).min(1, initial=np.inf)
 
     def act(self) -> None:
         """Accelerations of all surrounding vehicles: IDM behind leaders, braking before stops.
@@ -210,7 +222,7 @@ class IntersectionRoad(RegulatedRoad):
         room = self.stop - s
         need = v**2 / (2 * np.maximum(room, 0.1))
         brake = (need > 2.0) | (room < 1.0)
-        a = np.where(brake & (room > -1.0), np.minimum(a, -np.maximum(need, 0.5)), a)
+        a = np.where(brake, np.minimum(a, -np.maximum(need, 0.5)), a)
         self.acceleration = np.clip(a, -RouteVehicle.ACC_MAX, RouteVehicle.ACC_MAX)
 
     def _leaders(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

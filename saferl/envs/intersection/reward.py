@@ -51,9 +51,7 @@ class Reward:
                 f"reward.reading must be one of {', '.join(READINGS)}, got {self.reading!r}."
             )
         if not self.destination_scale > 0:
-            raise ValueError(
-                f"reward.destination_scale must be > 0, got {self.destination_scale}."
-            )
+            raise ValueError(f"reward.destination_scale must be > 0, got {self.destination_scale}.")
 
     def reference(self, ego: Tensor, route: Tensor) -> Tensor:
         """r_ref [...] of the state ``ego`` [..., 6] on ``route`` [...]."""
@@ -115,4 +113,3 @@ class Reward:
             success: bool [...].
         """
         return torch.stack(list(self.terms(*args, **kwargs).values())).sum(0)
-

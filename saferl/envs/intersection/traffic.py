@@ -25,7 +25,7 @@ _WEIGHTS = {
     "lt": [[1, 1, 1, 1], [2, 3, 3, 1], [1, 3, 3, 1], [2, 2, 2, 1]],
     "gs_inner": [[1, 1, 1, 1], [2, 2, 2, 1], [2, 1, 1, 1], [2, 2, 2, 1]],
     "gs_outer": [[1, 1, 1, 1], [2, 2, 2, 1], [2, 1, 1, 1], [2, 2, 2, 1]],
-    "rt": [[1, 1, 1, 1], [1, 2, 8, 1], [1, 1, 1, 1], [1, 1, 1, 1]],
+    "rt": [[1, 1, 3, 3], [1, 1, 30, 1], [1, 1, 1, 1], [1, 1, 1, 1]],
 }
 ROUTE_WEIGHTS = np.array([_WEIGHTS[name] for name in ROUTES], dtype=np.float64).reshape(-1, 16)
 
@@ -47,7 +47,7 @@ class RouteVehicle(IDMVehicle):
     COMFORT_ACC_MAX = 3.0  # m/s^2
     COMFORT_ACC_MIN = -5.0
     ACC_MAX = 6.0
-    DISTANCE_WANTED = 2.0 + LENGTH  # m, centre to centre
+    DISTANCE_WANTED = 3.0 + LENGTH  # m, centre to centre
     TIME_WANTED = 1.2  # s
     YIELDING_COLOR = (255, 170, 60)
 
@@ -73,6 +73,11 @@ class RouteVehicle(IDMVehicle):
             self.lane_index = self.target_lane_index = index
             self.lane = self.road.network.get_lane(index)
             self.route = list(self.table.lanes[self.route_id][segment:])
+
+    @property
+    def color(self) -> tuple[int, int, int] | None:
+        """Orange while it waits for others, otherwise highway-env's own colour."""
+        return self.YIELDING_COLOR if self.is_yielding else None
 
     def act(self, action=None) -> None:
         """Nothing: the road decides for all vehicles at once."""

@@ -15,8 +15,7 @@ from torchrl.envs.transforms import Transform
 from saferl.modules.projection import project
 
 _STASH = "_safety_projection"
-_REPORT: dict[str, torch.dtype | None] = {
-    "action_executed": None,  # the action's own
+_REPORT = {
     "risk_before": torch.float32,
     "risk_after": torch.float32,
     "projection_steps": torch.float32,
@@ -117,8 +116,9 @@ class SafetyProjector(Transform):
 
     def _risk_of_action(self, tensordict: TensorDictBase) -> Callable[[Tensor], Tensor]:
         """The risk [N, 1] as a function of the action alone [N, A]."""
-        if hasattr(self.risk, "bind"):
-            return self.risk.bind(tensordict)
+        bind = getattr(self.risk, "bind", None)
+        if bind is not None:
+            return bind(tensordict)
         inputs = tensordict.select(*self.risk.in_keys)
         key = self.risk.out_keys[0]
         return lambda action: self.risk(inputs.copy().set(self.action_key, action)).get(key)
@@ -159,22 +159,26 @@ class SafetyProjector(Transform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        spec = self.container.full_observation_spec
-        for key in _REPORT:
-            tensordict_reset.set(key, spec[key].zero())
+        env = self.container
+        if env is None:
+            raise RuntimeError("SafetyProjector must be appended to an environment.")
+        for key in ("action_executed", *_REPORT):
+            tensordict_reset.set(key, env.full_observation_spec[key].zero())
         return tensordict_reset
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        action = self.parent.full_action_spec[self.action_key]
+        env = self.parent
+        if env is None:
+            raise RuntimeError("SafetyProjector must be appended to an environment.")
+        action = env.full_action_spec[self.action_key]
         report = observation_spec.clone()
+        report["action_executed"] = Unbounded(
+            action.shape, device=action.device, dtype=action.dtype
+        )
+        shape = torch.Size((*report.shape, 1))
         for key, dtype in _REPORT.items():
-            if key == "action_executed":
-                spec = Unbounded(action.shape, device=action.device, dtype=action.dtype)
-            else:
-                shape = (*report.shape, 1)
-                kind = Binary if dtype is torch.bool else Unbounded
-                spec = kind(shape=shape, device=action.device, dtype=dtype)
-            report[key] = spec
+            kind = Binary if dtype is torch.bool else Unbounded
+            report[key] = kind(shape=shape, device=action.device, dtype=dtype)
         return report
 
 
