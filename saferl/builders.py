@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import hydra
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase, RewardScaling, RewardSum, TransformedEnv
@@ -22,6 +23,7 @@ from saferl.envs.transforms import ExecutedAction, SafetyProjector
 from saferl.hooks import ProjectorProgress
 from saferl.modules import tanh_gaussian_actor, value_operator
 from saferl.trainer import Budget, Learner, Trainer
+from saferl.validation import check_training
 
 #: What the replay buffer keeps of a transition.
 STORED = (
@@ -47,41 +49,6 @@ def device_of(cfg: DictConfig) -> torch.device:
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     return torch.device(name)
-
-
-def check(cfg: DictConfig) -> None:
-    """Refuse numbers out of range, before anything is built.
-
-    Raises:
-        ValueError: names the key, the value and what is allowed.
-    """
-    bounds = {
-        "gamma": (0.0, 1.0),
-        "tau": (0.0, 1.0),
-        "cost_limit": (0.0, float("inf")),
-        "reward_scale": (0.0, float("inf")),
-        "updates_per_frame": (0.0, float("inf")),
-        "batch_size": (1, float("inf")),
-        "buffer_size": (1, float("inf")),
-        "warmup_frames": (1, float("inf")),
-        "threads": (1, float("inf")),
-        "evaluation.episodes": (1, float("inf")),
-        "evaluation.num_envs": (1, float("inf")),
-    }
-    for key, (low, high) in bounds.items():
-        value = OmegaConf.select(cfg, key)
-        if value is None:
-            continue
-        if not isinstance(value, (int, float)) or not low <= value <= high:
-            allowed = f">= {low}" if high == float("inf") else f"in [{low}, {high}]"
-            raise ValueError(f"{key} must be {allowed}, got {value!r}.")
-    if cfg.buffer_size < cfg.batch_size:
-        raise ValueError(
-            f"buffer_size must be >= batch_size, got {cfg.buffer_size} and {cfg.batch_size}."
-        )
-    for name, rates in cfg.lr.items():
-        if len(rates) != 2 or min(rates) < 0:
-            raise ValueError(f"lr.{name} must be [first, last], both >= 0, got {list(rates)}.")
 
 
 def make(node: DictConfig, **objects: Any) -> Any:
@@ -112,20 +79,46 @@ class Agent:
     projector: SafetyProjector | None
 
 
+def _check_parts(cfg: DictConfig) -> None:
+    """Refuse parts that do not go together."""
+    takes = inspect.signature(hydra.utils.get_object(cfg.loss._target_)).parameters
+    constrained = "cost_critic" in takes
+    parts = {
+        "cost_critic": cfg.cost_critic.members > 0,
+        "lagrange": cfg.lagrange.multiplier is not None,
+    }
+    for name, present in parts.items():
+        if present and not constrained:
+            raise ValueError(
+                f"{cfg.loss._target_} takes no {name}: set {name}=none, or loss=sac_lag."
+            )
+        if constrained and not present:
+            raise ValueError(f"{cfg.loss._target_} needs {name}, got {name}=none.")
+    if cfg.projector._target_ is not None and not constrained:
+        raise ValueError("projector needs cost critics: set projector=none, or loss=sac_lag.")
+
+
 def build_agent(cfg: DictConfig) -> Agent:
-    """Networks, loss and projector, on the configured device."""
+    """Networks, loss and projector, on the configured device.
+
+    Raises:
+        ValueError: parts that do not go together.
+    """
+    _check_parts(cfg)
+    device = device_of(cfg)
     width = cfg.encoder.policy.width
-    actor = tanh_gaussian_actor(hydra.utils.instantiate(cfg.encoder.policy), width)
+    actor = tanh_gaussian_actor(hydra.utils.instantiate(cfg.encoder.policy), width).to(device)
 
     def critics(members: int, out_key: str) -> list[TensorDictModuleBase]:
         networks = (hydra.utils.instantiate(cfg.encoder.value) for _ in range(members))
-        return [value_operator(network, out_key=out_key) for network in networks]
+        return [value_operator(network.to(device), out_key=out_key) for network in networks]
 
     parts = {
         "actor_network": actor,
         "qvalue_network": critics(cfg.critic.members, "state_action_value"),
         "num_qvalue_nets": cfg.critic.members,
         "target_entropy": cfg.target_entropy,
+        "alpha_init": cfg.alpha_init,
     }
     if cfg.cost_critic.members:
         parts |= {
@@ -134,7 +127,7 @@ def build_agent(cfg: DictConfig) -> Agent:
         }
     if cfg.lagrange.multiplier is not None:
         parts["lagrange"] = hydra.utils.instantiate(cfg.lagrange.multiplier)
-    loss = make(cfg.loss, **parts).to(device_of(cfg))
+    loss = make(cfg.loss, **parts).to(device)
     loss.make_value_estimator(gamma=cfg.gamma)
     projector = None
     if cfg.projector._target_ is not None:
@@ -142,10 +135,15 @@ def build_agent(cfg: DictConfig) -> Agent:
     return Agent(actor, loss, projector)
 
 
-def load_agent(cfg: DictConfig, path: Path) -> Agent:
-    """An agent with the weights of a run or checkpoint."""
+def load_agent(cfg: DictConfig, path: Path, name: str) -> Agent:
+    """An agent with the networks of a run or checkpoint; ``name`` is the option that gave it.
+
+    Raises:
+        FileNotFoundError: there is no checkpoint.
+        ValueError: the checkpoint is of another architecture.
+    """
     agent = build_agent(cfg)
-    load_component(latest(path), agent.loss, "loss")
+    load_component(latest(path, name), agent.loss, "loss")
     return agent
 
 
@@ -172,14 +170,35 @@ def build_optimizer(cfg: DictConfig, loss: LossModule) -> torch.optim.Optimizer:
     )
 
 
+def build_loggers(cfg: DictConfig, run: Path) -> list:
+    """TorchRL loggers that write into the run's folder.
+
+    Raises:
+        ImportError: a logger's own package is not installed.
+    """
+    try:
+        return [make(sink, log_dir=str(run)) for sink in cfg.logger.sinks]
+    except ImportError as error:
+        names = ", ".join(sink._target_ for sink in cfg.logger.sinks)
+        raise ImportError(
+            f"logger: {names} needs a package that is not installed ({error}); "
+            "install it (pip install 'saferl[wandb]' for W&B), or use logger=tensorboard or none."
+        ) from error
+
+
 def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
-    """Everything of a training run, wired; fails before the first environment step if it must."""
-    check(cfg)
+    """Everything of a training run, wired; fails before the first environment step if it must.
+
+    Raises:
+        ValueError: something in the configuration cannot be meant; names the key.
+        FileNotFoundError: ``init`` names no checkpoint.
+    """
+    check_training(cfg)
     budget = Budget(cfg.episodes, cfg.frames)
     torch.set_num_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
     scenario = hydra.utils.instantiate(cfg.task)
-    agent = load_agent(cfg, Path(cfg.init)) if cfg.init else build_agent(cfg)
+    agent = load_agent(cfg, Path(cfg.init), "init") if cfg.init else build_agent(cfg)
 
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
     transforms = [sums, agent.projector] if agent.projector else [sums]
@@ -194,8 +213,11 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         track_traj_ids=False,
         auto_register_policy_transforms=False,
     )
+    device = device_of(cfg)
     buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(cfg.buffer_size, device=device_of(cfg)), batch_size=cfg.batch_size
+        storage=LazyTensorStorage(cfg.buffer_size, device=device),
+        batch_size=cfg.batch_size,
+        generator=torch.Generator(device).manual_seed(cfg.seed),
     )
     buffer.append_transform(RewardScaling(0.0, cfg.reward_scale, in_keys=[("next", "reward")]))
     if agent.projector is not None:
@@ -217,10 +239,10 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         warmup_frames=cfg.warmup_frames,
         record_every=cfg.record_every,
         save_every=cfg.save_every,
-        loggers=[make(sink, log_dir=str(run)) for sink in cfg.logger.sinks],
     )
     if cfg.lagrange.signal is not None:
         hydra.utils.instantiate(cfg.lagrange.signal).register(trainer)
     if agent.projector is not None:
         ProjectorProgress(agent.projector).register(trainer)
+    trainer.loggers = build_loggers(cfg, run)
     return trainer

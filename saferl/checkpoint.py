@@ -1,21 +1,30 @@
 """Whole runs on disk: atomic, without pickle, and enough to continue exactly.
 
 TorchRL's own checkpoint coordinator writes and rotates; this module adds the components that it does
-not know: the collector in mid-episode, and files that grow while a run lasts.
+not know: the collector in mid-episode, the buffer as plain tensors, and files that grow while a run
+lasts.
 """
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
-from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+from torch import Tensor
+from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation, GlobalRNGState
 from torchrl.collectors import Collector
+from torchrl.data import ReplayBuffer
 from torchrl.envs import EnvBase, TransformedEnv
 
+CONFIG = "config.yaml"
 FOLDER = "checkpoints"
+EXPORTED = "policy.torchrl"
+_CPU = torch.device("cpu")
 
 
 class CollectorState:
@@ -23,6 +32,9 @@ class CollectorState:
 
     TorchRL's ``Collector.state_dict`` holds neither the base environment nor the observation that the
     next action answers, so a run restored from it alone starts new episodes.
+
+    Args:
+        collector: in this process, on an environment with ``state_dict`` and ``load_state_dict``.
     """
 
     def __init__(self, collector: Collector):
@@ -57,22 +69,111 @@ class CollectorState:
         collector._frames, collector._iter = state["frames"], state["iter"]
 
 
+class BufferState:
+    """The filled rows of a replay buffer, where it writes next, and what it samples by.
+
+    ``ReplayBuffer.dumps`` pickles its transforms and its prefetch queue; this does not. The
+    transforms are settings, not state, and are not saved.
+
+    Args:
+        buffer: without prefetching, over a tensor storage.
+    """
+
+    def __init__(self, buffer: ReplayBuffer):
+        self.buffer = buffer
+
+    def state_dict(self) -> dict[str, Any]:
+        """Rows [n, ...], writer, sampler and generator."""
+        buffer, count = self.buffer, len(self.buffer)
+        return {
+            "count": count,
+            "rows": buffer.storage[:count].to_dict() if count else {},
+            "writer": buffer.writer.state_dict(),
+            "sampler": buffer.sampler.state_dict(),
+            "generator": None if buffer._rng is None else buffer._rng.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Fill the buffer as it was.
+
+        Raises:
+            ValueError: it is smaller than what was saved.
+        """
+        buffer, count = self.buffer, state["count"]
+        if count > buffer.storage.max_size:
+            raise ValueError(
+                f"buffer_size must be >= {count}, the saved rows, got {buffer.storage.max_size}."
+            )
+        buffer.empty()
+        if count:
+            buffer.storage.set(
+                torch.arange(count), TensorDict.from_dict(state["rows"], batch_size=[count])
+            )
+        buffer.writer.load_state_dict(state["writer"])
+        buffer.sampler.load_state_dict(state["sampler"])
+        if state["generator"] is not None:
+            buffer._rng.set_state(state["generator"].cpu())
+
+
 class GrowingFiles:
-    """Append-only text files, cut back to their length at the checkpoint when it is loaded."""
+    """Small text files that grow while a run lasts; they return to what they were when saved.
+
+    Args:
+        *paths: the files.
+    """
 
     def __init__(self, *paths: Path):
         self.paths = paths
 
-    def state_dict(self) -> dict[str, int]:
-        """Length of each file in bytes, by name."""
-        return {path.name: path.stat().st_size if path.exists() else 0 for path in self.paths}
+    def state_dict(self) -> dict[str, str]:
+        """Text of each file by name."""
+        return {path.name: path.read_bytes().decode() for path in self.paths if path.exists()}
 
-    def load_state_dict(self, state: dict[str, int]) -> None:
-        """Cut each file back; what was written after the checkpoint will be written again."""
+    def load_state_dict(self, state: dict[str, str]) -> None:
+        """Rewrite each file; what came after the checkpoint will be written again."""
         for path in self.paths:
-            if path.exists():
-                with path.open("r+b") as file:
-                    file.truncate(state[path.name])
+            if path.name in state:
+                path.write_bytes(state[path.name].encode())
+            else:
+                path.unlink(missing_ok=True)
+
+
+class Fitting:
+    """A module whose loading names the parameters that differ, instead of listing them all.
+
+    Args:
+        module: the live module.
+        name: what it is called in errors.
+    """
+
+    def __init__(self, module: torch.nn.Module, name: str = "loss"):
+        self.module, self.name = module, name
+
+    def state_dict(self) -> Mapping[str, Any]:
+        return self.module.state_dict()
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Load into the live parameters.
+
+        Raises:
+            ValueError: names or shapes differ; tells the first and how many.
+        """
+        mine = self.module.state_dict()
+        differences = [
+            f"{key} is {_shape(state.get(key))} in the checkpoint and {_shape(mine.get(key))} here"
+            for key in sorted({*mine, *state})
+            if _shape(state.get(key)) != _shape(mine.get(key))
+        ]
+        if differences:
+            more = f" (and {len(differences) - 1} more)" if len(differences) > 1 else ""
+            raise ValueError(f"another {self.name}: {differences[0]}{more}.")
+        self.module.load_state_dict(state)
+
+
+def _shape(value: Any) -> str:
+    if value is None:
+        return "absent"
+    return str(list(value.shape)) if isinstance(value, Tensor) else "a setting"
 
 
 class RunCheckpoint:
@@ -81,11 +182,11 @@ class RunCheckpoint:
     Args:
         run: the run's folder.
         keep: how many to keep.
-        **components: whatever has ``state_dict`` and ``load_state_dict`` (or dumps and loads, as a
-            replay buffer).
+        **components: whatever has ``state_dict`` and ``load_state_dict``.
     """
 
     def __init__(self, run: Path, keep: int = 1, **components: Any):
+        self.run = run
         self.checkpoint = Checkpoint(**components, rng=GlobalRNGState())
         self.rotation = CheckpointRotation(run / FOLDER, keep_last=keep)
 
@@ -94,45 +195,105 @@ class RunCheckpoint:
         return self.rotation.save(self.checkpoint, step=frames, metadata=metadata)
 
     def load_latest(self) -> Path:
-        """Restore every component from the newest checkpoint.
+        """Restore every component from the newest checkpoint, and clear away unfinished ones.
 
         Raises:
             FileNotFoundError: the run holds none.
+            ValueError: a component does not fit.
         """
-        path = latest(self.rotation.directory.parent)
-        self.checkpoint.load(path, strict="error")
+        path = latest(self.run, "resume")
+        for leftover in self.rotation.directory.glob(".checkpoint-*"):
+            shutil.rmtree(leftover, ignore_errors=True)
+        _load(self.checkpoint, path)
         return path
 
 
-def latest(run: Path) -> Path:
-    """Newest checkpoint of a run's folder; a checkpoint's own folder is returned as it is.
+def _load(checkpoint: Checkpoint, path: Path) -> None:
+    try:
+        checkpoint.load(path, strict="error", map_location=_CPU)
+    except (CheckpointError, OSError) as error:
+        raise ValueError(
+            f"checkpoint {path} does not fit this configuration: {error.__cause__ or error} "
+            f"Use the configuration that it was trained with ({CONFIG} in its run)."
+        ) from error
+
+
+def latest(run: Path, option: str = "checkpoint") -> Path:
+    """Newest checkpoint of a run's folder, or an exported policy; a checkpoint itself as it is.
+
+    Args:
+        run: folder or file.
+        option: what errors call it.
 
     Raises:
         FileNotFoundError: there is no such folder, or no checkpoint in it.
     """
     if not run.exists():
-        raise FileNotFoundError(f"checkpoint: no such file or folder: {run}")
-    if Checkpoint.is_checkpoint(run):
-        return run
-    path = (
-        CheckpointRotation(run / FOLDER, keep_last=1).latest() if (run / FOLDER).exists() else None
-    )
+        raise FileNotFoundError(f"{option}: no such file or folder: {run}")
+    for path in (run, run / EXPORTED):
+        if Checkpoint.is_checkpoint(path):
+            return path
+    folder = run / FOLDER
+    path = CheckpointRotation(folder, keep_last=1).latest() if folder.is_dir() else None
     if path is None:
-        raise FileNotFoundError(f"checkpoint: {run} holds no checkpoint (looked in {run / FOLDER})")
+        raise FileNotFoundError(f"{option}: {run} holds no checkpoint (looked in {folder}).")
     return path
 
 
-def load_component(path: Path, component: Any, name: str) -> None:
-    """Load one named component of a checkpoint into a live object.
+def run_folder(path: Path, option: str = "checkpoint") -> Path:
+    """Folder of the run that a checkpoint belongs to: the one with ``config.yaml``.
+
+    Args:
+        path: a run's folder, or a checkpoint in it.
+        option: what errors call it.
+
+    Raises:
+        FileNotFoundError: no config.yaml where it should be.
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"{option}: no such file or folder: {path}")
+    nested = path.absolute().parent.name == FOLDER
+    for folder in (path, *path.absolute().parents[: 2 if nested else int(path.is_file())]):
+        if (folder / CONFIG).is_file():
+            return folder
+    raise FileNotFoundError(f"{option}: no {CONFIG} in {path}; is it a saferl run?")
+
+
+def load_component(path: Path, module: torch.nn.Module, name: str) -> None:
+    """Load one named component of a checkpoint into a live module.
 
     Raises:
         ValueError: the parameters do not fit; names the first that differs.
     """
-    checkpoint = Checkpoint(**{name: component})
-    try:
-        checkpoint.load(path, strict="error", map_location=torch.device("cpu"))
-    except Exception as error:
-        raise ValueError(
-            f"checkpoint {path} does not fit the configured {name}: {error} "
-            "Use the configuration it was trained with (config.yaml in its run)."
-        ) from error
+    _load(Checkpoint(**{name: Fitting(module, name)}), path)
+
+
+class _Held:
+    """Carries one component's state from a checkpoint to another."""
+
+    def load_state_dict(self, state: dict) -> None:
+        self.state = state
+
+    def state_dict(self) -> dict:
+        return self.state
+
+
+def export(path: Path, folder: Path) -> Path:
+    """Write what a trained policy needs into a folder: its configuration, and one file of networks.
+
+    Args:
+        path: a run, or a checkpoint in it.
+        folder: gets ``config.yaml`` and ``policy.torchrl``; ``checkpoint=`` and ``init=`` read it.
+
+    Raises:
+        FileNotFoundError: ``path`` holds no run or no checkpoint.
+    """
+    config = OmegaConf.load(run_folder(path) / CONFIG)
+    assert isinstance(config, DictConfig)
+    checkpoint = Checkpoint(loss=_Held())
+    _load(checkpoint, latest(path))
+    folder.mkdir(parents=True, exist_ok=True)
+    checkpoint.save(folder / EXPORTED, format="archive")
+    # Where the run lay is nobody else's business.
+    OmegaConf.save(OmegaConf.merge(config, {"out": None, "init": None}), folder / CONFIG)
+    return folder

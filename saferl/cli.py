@@ -1,103 +1,100 @@
-"""What the commands do once Hydra has composed their configuration."""
+"""From a command line to a command: Hydra's composition, and one clear line for every mistake."""
 
 from __future__ import annotations
 
-import dataclasses
-import logging
+import difflib
+import os
 import sys
-from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
+import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import InstantiationException
+from hydra.errors import HydraException, InstantiationException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from saferl.builders import build_env, build_trainer
-from saferl.envs.transforms import SafetyProjector
-from saferl.evaluation import evaluate, write
-from saferl.metrics import table
-from saferl.trainer import Trainer
+from saferl.paths import config_dir
 
-log = logging.getLogger(__name__)
-CONFIG = "config.yaml"
+#: What a user can get wrong; any other exception is a fault of ours and keeps its trace.
+MISTAKES = (ValueError, OSError, ImportError, HydraException, OmegaConfBaseException)
+INTERRUPTED = 130
 
 
-def guard(command: Callable[[DictConfig], None], cfg: DictConfig) -> None:
-    """Run a command; a mistake in its input ends it with one clear line, and not with a trace."""
-    try:
-        command(cfg)
-    except InstantiationException as error:
-        raise SystemExit(f"error: {error.__cause__ or error} (in {_place(error)})") from error
-    except (ValueError, FileNotFoundError, OmegaConfBaseException) as error:
-        raise SystemExit(f"error: {error}") from error
-    except KeyboardInterrupt:
-        sys.exit(130)
+def launch(command: str, config: str) -> None:
+    """Run a function of :mod:`saferl.commands` on the configuration that ``sys.argv`` describes.
 
-
-def _place(error: InstantiationException) -> str:
-    lines = str(error).splitlines()
-    return lines[-1].removeprefix("full_key: ") if "full_key" in lines[-1] else "the configuration"
-
-
-def run_config(run: Path) -> DictConfig:
-    """The resolved configuration that a run was trained with.
-
-    Raises:
-        FileNotFoundError: the folder holds no config.yaml.
+    Exits with 0, with 1 after one line about a mistake, or with 130 after Ctrl-C.
+    ``HYDRA_FULL_ERROR=1`` shows the trace instead of the line.
     """
-    for folder in (run, *run.parents[:2]):
-        if (folder / CONFIG).is_file():
-            return OmegaConf.load(folder / CONFIG)
-    raise FileNotFoundError(f"checkpoint: no {CONFIG} in {run} or above it; is it a saferl run?")
+    before = os.environ.get("HYDRA_FULL_ERROR")
+    # Hydra prints its own exceptions over many lines unless it is told to let them pass.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+
+    def run(cfg: DictConfig) -> None:
+        from saferl import commands  # late: help and most mistakes need no torch
+
+        try:
+            getattr(commands, command)(cfg)
+        except BaseException:
+            _drop_if_empty(Path(HydraConfig.get().runtime.output_dir))
+            raise
+
+    try:
+        hydra.main(version_base="1.3", config_path=config_dir(), config_name=config)(run)()
+    except BrokenPipeError:  # whoever read our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except MISTAKES as error:
+        if before == "1":
+            raise
+        raise SystemExit(f"error: {explain(error, config, sys.argv[1:])}") from None
+    except KeyboardInterrupt as interrupt:
+        print(str(interrupt) or "Interrupted.", file=sys.stderr)
+        raise SystemExit(INTERRUPTED) from None
+    finally:
+        del os.environ["HYDRA_FULL_ERROR"]
+        if before is not None:
+            os.environ["HYDRA_FULL_ERROR"] = before
 
 
-def train(cfg: DictConfig) -> None:
-    """Train, or continue a run, then test the result."""
-    if cfg.resume is not None:
-        others = [
-            o for o in HydraConfig.get().overrides.task if not o.startswith(("resume=", "out="))
-        ]
-        if others:
-            raise ValueError(
-                "resume continues a run as it was configured and takes no other option, "
-                f"got {', '.join(others)}."
-            )
-        run = Path(cfg.resume)
-        cfg = run_config(run)
-        trainer = build_trainer(cfg, run)
-        trainer.resume()
-    else:
-        run = Path(HydraConfig.get().runtime.output_dir)
-        OmegaConf.resolve(cfg)
-        trainer = build_trainer(cfg, run)
-        run.mkdir(parents=True, exist_ok=True)
-        OmegaConf.save(cfg, run / CONFIG)
-    log.info("%s on %s, seed %d. Files: %s", cfg.algo_name, cfg.task.task, cfg.seed, run)
-    trainer.train()
-    test(cfg, trainer, run)
+def _drop_if_empty(folder: Path) -> None:
+    """Hydra makes the output folder before anything can be checked."""
+    if folder != Path.cwd():
+        with suppress(OSError):
+            folder.rmdir()
 
 
-def test(cfg: DictConfig, trainer: Trainer, run: Path) -> None:
-    """Measure what was trained, under the conditions of a test, and report the table."""
-    test_cfg = cfg.evaluation
-    scenario = dataclasses.replace(
-        trainer.collector.env.base_env.scenario,
-        policy_frequency=test_cfg.policy_frequency,
-        route_starts=0.0,
-        standstill=None,
-        reward=dataclasses.replace(
-            trainer.collector.env.base_env.scenario.reward, risk_shaping=False
-        ),
-    )
-    projectors = [t for t in trainer.collector.env.transform if isinstance(t, SafetyProjector)]
-    for projector in projectors:
-        projector.reset_parent()
-    env = build_env(cfg, scenario, min(test_cfg.num_envs, test_cfg.episodes), cfg.seed, *projectors)
-    rows = evaluate(trainer.collector.policy, env, test_cfg.episodes, cfg.seed)
-    figures = write(rows, run / "evaluation", task=cfg.task.task, episodes=test_cfg.episodes)
-    log.info(
-        "\n%s\nFiles: %s",
-        table(figures, f"{cfg.algo_name}: {test_cfg.episodes} test episodes of {cfg.task.task}"),
-        run,
-    )
+def explain(error: Exception, config: str = "config", arguments: list[str] | None = None) -> str:
+    """A mistake in one line: which key, what was given, what is expected."""
+    if isinstance(error, MissingConfigException) and error.options:
+        group, _, choice = str(error.missing_cfg_file).rpartition("/")
+        return f"{group} must be one of {', '.join(error.options)}, got {choice!r}."
+    if isinstance(error, InstantiationException):
+        place = str(error).rpartition("full_key: ")[2]
+        cause = error.__cause__ or str(error).splitlines()[0]
+        return f"{cause} (in {place})" if place != str(error) else str(cause)
+    message = " ".join(str(error).split())
+    if message.startswith("Could not override"):
+        return _unknown_key(message.split("'")[1], config, arguments or [])
+    if isinstance(error, HydraException):
+        return message.partition(" See https")[0]
+    return message
+
+
+def _unknown_key(key: str, config: str, arguments: list[str]) -> str:
+    """Tells what stands beside a key that does not exist."""
+    rest = [a for a in arguments if "=" in a and not a.lstrip("+~").startswith((key, "-"))]
+    try:
+        with hydra.initialize_config_dir(config_dir(), version_base="1.3"):
+            composed = hydra.compose(config, rest)
+    except HydraException:
+        return f"unknown key {key!r}; --help lists the keys."
+    parent, _, name = key.rpartition(".")
+    node = OmegaConf.select(composed, parent) if parent else composed
+    while parent and not isinstance(node, DictConfig):
+        parent, _, name = parent.rpartition(".")
+        node = OmegaConf.select(composed, parent) if parent else composed
+    choices = [str(k) for k in node if k != "_target_"]
+    close = difflib.get_close_matches(name, choices, n=1)
+    hint = f" (did you mean {close[0]}?)" if close else ""
+    return f"unknown key {key!r}{hint}; choose from {', '.join(choices)}, or add it with +{key}=..."

@@ -3,33 +3,59 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
+from saferl.envs.intersection import Scenario
 from saferl.envs.intersection.base import episode_seeds
 from saferl.envs.intersection.geometry import ROUTES
 from saferl.metrics import summarise
 
 
+def as_test(scenario: Scenario, policy_frequency: int = 10) -> Scenario:
+    """The conditions of a test: another rate of decisions, every start before the box, parked cars
+    left to themselves, and the reward without r_safe, which is the same for every algorithm.
+
+    >>> as_test(Scenario(route_starts=0.5)).route_starts
+    0.0
+    """
+    return dataclasses.replace(
+        scenario,
+        policy_frequency=policy_frequency,
+        route_starts=0.0,
+        standstill=None,
+        reward=dataclasses.replace(scenario.reward, risk_shaping=False),
+    )
+
+
 @torch.no_grad()
-def play(policy: TensorDictModuleBase, env: EnvBase, seeds: torch.Tensor) -> list[TensorDictBase]:
+def play(
+    policy: TensorDictModuleBase,
+    env: EnvBase,
+    seeds: Tensor,
+    ended: Callable[[int], object] = lambda count: None,
+) -> list[TensorDictBase]:
     """One episode of each environment, to its own end.
 
     Args:
         policy: any module that reads the observation and writes ``action``; its mean action is used.
         env: an intersection with batch size [B], with or without transforms.
         seeds: int64 [B], the episodes to play.
+        ended: told after each decision how many episodes ended with it.
 
     Returns:
-        The transitions of every decision [T, B], and until when each episode lasted: ``alive``
-        [T, B] is True up to and including its last decision.
+        The transitions of every decision, each [B]; ``alive`` [B] (bool) is True up to and including
+        the last decision of an episode.
     """
     steps = []
     with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -38,34 +64,41 @@ def play(policy: TensorDictModuleBase, env: EnvBase, seeds: torch.Tensor) -> lis
         while alive.any():
             tensordict = env.step(policy(tensordict))
             steps.append(tensordict.clone().set("alive", alive))
-            alive = alive & ~tensordict["next", "done"].squeeze(-1)
+            done = tensordict["next", "done"].squeeze(-1)
+            ended(int((alive & done).sum()))
+            alive = alive & ~done
             tensordict = env.step_mdp(tensordict)
     return steps
 
 
-def episode_rows(steps: list[TensorDictBase], seeds: torch.Tensor) -> list[dict]:
-    """Figures of each episode of :func:`play`: one dict an episode, in the order of ``seeds``."""
-    alive = torch.stack([step["alive"] for step in steps]).float()
+def episode_rows(steps: list[TensorDictBase], seeds: Tensor) -> list[dict]:
+    """Figures of each episode of :func:`play`: one dict an episode, in the order of ``seeds``.
 
-    def over_time(key: str) -> torch.Tensor:
+    ``collision`` counts leaving the road too; ``hit_vehicle`` and ``left_road`` tell them apart.
+    ``speed`` (m/s), ``min_distance`` (m, to another vehicle) and ``cost_return`` are over the whole
+    episode, ``intervention_rate`` is the share of decisions that a projector changed, and
+    ``correction`` the mean size of such a change.
+    """
+    alive = torch.stack([step["alive"] for step in steps])
+    length = alive.sum(0)
+    last = (length - 1)[None]
+
+    def over_time(key: str) -> Tensor:
         return torch.stack([step["next", key].float().squeeze(-1) for step in steps])
 
-    length = alive.sum(0)
-    ego = torch.stack([step["next", "ego"] for step in steps])
-    last = (length.long() - 1)[None]
+    def total(values: Tensor) -> Tensor:
+        return torch.where(alive, values, 0.0).sum(0)
 
-    def at_end(key: str) -> torch.Tensor:
+    def at_end(key: str) -> Tensor:
         return over_time(key).gather(0, last).squeeze(0)
 
-    first = steps[0]
-    zero = torch.zeros_like(alive)
-    projected = "action_executed" in first["next"].keys()
-    moved, shift = zero, zero
-    if projected:
+    moved = shift = torch.zeros(alive.shape, device=alive.device)
+    if "action_executed" in steps[0]["next"].keys():
         moved = over_time("intervened")
         shift = torch.stack(
             [(step["next", "action_executed"] - step["action"]).norm(dim=-1) for step in steps]
         )
+    ego = torch.stack([step["next", "ego"] for step in steps])
     collision, offroad, success = at_end("collision"), at_end("offroad"), at_end("success")
     columns = {
         "collision": ((collision + offroad) > 0).float(),
@@ -73,16 +106,16 @@ def episode_rows(steps: list[TensorDictBase], seeds: torch.Tensor) -> list[dict]
         "frozen": ((collision + offroad + success) == 0).float(),
         "hit_vehicle": collision,
         "left_road": offroad,
-        "return": (over_time("reward") * alive).sum(0),
-        "speed": (torch.hypot(ego[..., 3], ego[..., 4]) * alive).sum(0) / length,
-        "cost_return": (over_time("cost") * alive).sum(0),
-        "intervention_rate": (moved * alive).sum(0) / length,
-        "correction": (shift * alive).sum(0) / (moved * alive).sum(0).clamp_min(1.0),
-        "min_distance": torch.where(alive > 0, ego[..., 7], torch.inf).amin(0),
+        "return": total(over_time("reward")),
+        "speed": total(torch.hypot(ego[..., 3], ego[..., 4])) / length,
+        "cost_return": total(over_time("cost")),
+        "intervention_rate": total(moved) / length,
+        "correction": total(shift) / total(moved).clamp_min(1.0),
+        "min_distance": torch.where(alive, ego[..., 7], torch.inf).amin(0),
         "decisions": length,
     }
     columns = {key: value.tolist() for key, value in columns.items()}
-    routes = first["route"].squeeze(-1).tolist()
+    routes = steps[0]["route"].squeeze(-1).tolist()
     return [
         {
             "seed": seed,
@@ -109,10 +142,20 @@ def evaluate(
     width = env.batch_size[0]
     seeds = episode_seeds(seed, -(-episodes // width) * width)
     rows: list[dict] = []
-    with tqdm(total=episodes, desc="evaluate", unit="episode", disable=not progress) as bar:
+    with tqdm(
+        total=episodes,
+        desc="test",
+        unit="episode",
+        dynamic_ncols=True,
+        mininterval=1.0,
+        disable=not progress,
+    ) as bar:
+
+        def ended(count: int) -> None:  # the last chunk may hold more episodes than are wanted
+            bar.update(min(count, episodes - bar.n))
+
         for chunk in seeds.split(width):
-            rows += episode_rows(play(policy, env, chunk.to(env.device)), chunk)
-            bar.update(min(episodes, len(rows)) - bar.n)
+            rows += episode_rows(play(policy, env, chunk.to(env.device), ended), chunk)
     return [{"episode": i, **row} for i, row in enumerate(rows[:episodes])]
 
 
@@ -120,7 +163,7 @@ def write(rows: list[dict], out: Path, **about: str | int | float) -> dict:
     """Write ``episodes.csv`` and ``metrics.json`` into a folder; returns the metrics."""
     out.mkdir(parents=True, exist_ok=True)
     with (out / "episodes.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
     figures = summarise(rows)

@@ -40,7 +40,7 @@ class EpisodeSignal:
         self._lagrange = _multiplier(trainer)
 
     def _update(self, finished: TensorDictBase, spent: float) -> None:
-        if finished.numel():
+        if len(finished):
             self._lagrange.update(finished["cost_return"] - self.cost_limit)
 
 

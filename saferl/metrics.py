@@ -12,7 +12,7 @@ import torch
 from scipy import stats
 from tensordict import TensorDict, TensorDictBase
 
-#: Name of each figure in ``metrics.json``, its short name in tables, and whether it is a rate.
+#: Name of each figure in ``metrics.json``, its short name in tables, and whether it counts episodes.
 FIGURES = {
     "collision_rate": ("CR", True),
     "success_rate": ("SR", True),
@@ -52,10 +52,13 @@ def finished_episodes(data: TensorDictBase) -> TensorDict:
 
 
 class EpisodeWindow:
-    """Means over the last episodes, and over the frames since the last summary's episodes.
+    """Means over the last episodes.
 
     Args:
         length: how many episodes.
+
+    >>> EpisodeWindow().short()
+    {}
     """
 
     KEYS = ("return", "cost_return", "collision", "success", "frozen")
@@ -78,7 +81,9 @@ class EpisodeWindow:
         return {name: round(mean, 6) for name, mean in zip(names, means, strict=True)}
 
     def short(self) -> dict[str, str]:
-        """The summary for a progress bar."""
+        """The summary for a progress bar; empty before the first episode."""
+        if not len(self.values):
+            return {}
         figures = self.summary()
         return {
             "return": f"{figures['return']:.1f}",
@@ -112,7 +117,7 @@ class CsvLog:
                 rows = list(csv.DictReader(file))
         columns = [*columns, *new]
         with self.path.open("w" if new else "a", newline="") as file:
-            writer = csv.DictWriter(file, columns, restval="")
+            writer = csv.DictWriter(file, columns, restval="", lineterminator="\n")
             if new:
                 writer.writeheader()
                 writer.writerows(rows)
@@ -130,7 +135,11 @@ def wilson(successes: int, trials: int, level: float = 0.95) -> tuple[float, flo
 
 
 def mean_interval(values: Sequence[float], level: float = 0.95) -> tuple[float, float]:
-    """Student's t interval of a mean; the mean itself when there is one value."""
+    """Student's t interval of a mean; the mean itself when there is one value.
+
+    >>> [round(bound, 2) for bound in mean_interval([1.0, 2.0, 3.0])]
+    [-0.48, 4.48]
+    """
     array = np.asarray(values, dtype=float)
     if len(array) < 2 or np.ptp(array) == 0:
         return float(array.mean()), float(array.mean())
@@ -147,13 +156,19 @@ def summarise(rows: Sequence[dict[str, float]]) -> dict[str, dict[str, float]]:
 
     Returns:
         ``{figure: {"mean", "low", "high"}}``; Wilson's interval for rates of episodes, Student's t
-        otherwise.
+        otherwise (within [0, 1] for the intervention rate, a mean of shares).
+
+    Raises:
+        ValueError: no rows.
     """
+    if not rows:
+        raise ValueError("summarise needs at least one episode, got none.")
     figures = {}
     for name, (_, is_rate) in FIGURES.items():
-        key = name.removesuffix("_rate") if is_rate else name
-        values = [float(row[key]) for row in rows]
+        values = [float(row[name.removesuffix("_rate") if is_rate else name]) for row in rows]
         low, high = wilson(round(sum(values)), len(values)) if is_rate else mean_interval(values)
+        if name.endswith("_rate"):
+            low, high = max(low, 0.0), min(high, 1.0)
         figures[name] = {"mean": sum(values) / len(values), "low": low, "high": high}
     return figures
 

@@ -1,26 +1,37 @@
-"""Where the configuration files lie."""
+"""Where the configuration files and the policies that ship with saferl lie."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from omegaconf import OmegaConf
+
+# ${first:a,b} in a configuration is the first of its arguments that is not null.
+OmegaConf.register_new_resolver(
+    "first", lambda *values: next(v for v in values if v is not None), replace=True
+)
+
+PACKAGE = Path(__file__).resolve().parent
+
 
 def config_dir() -> str:
-    """The ``conf`` folder: inside the installed package, or beside it in a checkout."""
-    package = Path(__file__).resolve().parent
-    for folder in (package / "conf", package.parent / "conf"):
+    """The ``conf`` folder: inside the installed package, or beside it in a checkout.
+
+    Raises:
+        FileNotFoundError: it is in neither place.
+    """
+    for folder in (PACKAGE / "conf", PACKAGE.parent / "conf"):
         if (folder / "config.yaml").is_file():
             return str(folder)
-    raise FileNotFoundError(f"saferl's conf folder is neither in {package} nor in its parent.")
+    raise FileNotFoundError(f"saferl's conf folder is neither in {PACKAGE} nor in its parent.")
 
 
-def pretrained_run(name: str) -> Path:
-    """Folder of a policy that ships with saferl.
+def pretrained_run(name: str, root: Path = PACKAGE / "pretrained") -> Path:
+    """Folder of a policy that ships with saferl, as :func:`saferl.checkpoint.export` wrote it.
 
     Raises:
         ValueError: no policy has this name; lists those that there are.
     """
-    root = Path(__file__).resolve().parent / "pretrained"
     names = sorted(path.name for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
     if name not in names:
         raise ValueError(

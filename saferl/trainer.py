@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import signal
+import threading
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +21,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.objectives import LossModule, SoftUpdate
 from tqdm import tqdm
 
-from saferl.checkpoint import CollectorState, GrowingFiles, RunCheckpoint
+from saferl.checkpoint import BufferState, CollectorState, Fitting, GrowingFiles, RunCheckpoint
 from saferl.metrics import CsvLog, EpisodeWindow
 
 log = logging.getLogger(__name__)
@@ -108,7 +110,7 @@ class Progress:
     updates: int = 0
     owed: float = 0.0
     last_record: int = 0
-    last_save: int = 0
+    last_save: int = -1
 
     def state_dict(self) -> dict[str, float]:
         return dict(self.__dict__)
@@ -124,6 +126,12 @@ class Clock:
         self.seconds: dict[str, float] = {"collect": 0.0, "learn": 0.0, "other": 0.0}
         self._last = time.perf_counter()
 
+    def state_dict(self) -> dict[str, float]:
+        return dict(self.seconds)
+
+    def load_state_dict(self, state: dict[str, float]) -> None:
+        self.seconds.update(state)
+
     @contextmanager
     def phase(self, name: str):
         start = time.perf_counter()
@@ -133,6 +141,27 @@ class Clock:
         finally:
             self._last = time.perf_counter()
             self.seconds[name] += self._last - start
+
+
+@contextmanager
+def _interrupts() -> Iterator[list[int]]:
+    """Collects Ctrl-C and SIGTERM, so that a run ends between two steps; a second one ends it now."""
+    received: list[int] = []
+
+    def note(number: int, frame: object) -> None:
+        if received:
+            raise KeyboardInterrupt("Interrupted twice: what came after the last checkpoint is lost.")
+        received.append(number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield received
+        return
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @dataclass
@@ -151,9 +180,9 @@ class Trainer:
         record_every: frames between two rows of ``metrics.csv``.
         save_every: frames between two checkpoints.
         after_collect: called with each batch's finished episodes (a TensorDict of per-episode
-            ``return``, ``cost_return`` and outcomes, [n, 1]) and the fraction of the budget spent.
+            ``return``, ``cost_return`` and outcomes, [n]) and the fraction of the budget spent.
         loggers: TorchRL loggers that receive the scalars of each row.
-        checkpointed: further components of a checkpoint.
+        window: means over the last episodes.
     """
 
     run: Path
@@ -166,11 +195,9 @@ class Trainer:
     warmup_frames: int = 1000
     record_every: int = 2000
     save_every: int = 50_000
-    keep_checkpoints: int = 1
     window: EpisodeWindow = field(default_factory=EpisodeWindow)
     after_collect: list[Callable[[TensorDictBase, float], None]] = field(default_factory=list)
     loggers: list = field(default_factory=list)
-    checkpointed: dict = field(default_factory=dict)
 
     def __post_init__(self):
         for name, least in (
@@ -188,16 +215,15 @@ class Trainer:
         self._count = 0
         self.checkpoint = RunCheckpoint(
             self.run,
-            self.keep_checkpoints,
-            loss=self.learner.loss,
+            loss=Fitting(self.learner.loss),
             optimizer=self.learner.optimizer,
-            buffer=self.buffer,
+            buffer=BufferState(self.buffer),
             collector=CollectorState(self.collector),
             progress=self.progress,
+            clock=self.clock,
             window=self.window,
             record=self,
             files=GrowingFiles(self.metrics.path, self.timing.path),
-            **self.checkpointed,
         )
 
     def state_dict(self) -> dict:
@@ -208,66 +234,97 @@ class Trainer:
         self._sums, self._count = dict(state["sums"]), state["count"]
 
     def resume(self) -> None:
-        """Continue from the newest checkpoint of the run."""
+        """Continue from the newest checkpoint of the run.
+
+        Raises:
+            FileNotFoundError: there is none.
+            ValueError: it does not fit what was built.
+        """
         path = self.checkpoint.load_latest()
         log.info("Resumed %s at frame %d.", path, self.progress.frames)
 
+    @property
+    def spent(self) -> float:
+        """Fraction of the budget that is spent, in [0, 1]."""
+        return self.budget.spent(self.progress.frames, self.progress.episodes)
+
     def train(self) -> None:
-        """Train until the budget is spent; a checkpoint is left at the end and at an interrupt."""
+        """Train until the budget is spent; checkpoints at the start, now and then, and at the end.
+
+        Raises:
+            KeyboardInterrupt: the first Ctrl-C, after a checkpoint was left; a second one at once.
+        """
         progress = self.progress
+        by_episode = self.budget.episodes is not None
+        if progress.last_save < 0:
+            self.save()
         bar = tqdm(
             total=self.budget.episodes or self.budget.frames,
-            initial=progress.episodes if self.budget.episodes else progress.frames,
-            unit="episode" if self.budget.episodes else "frame",
+            initial=progress.episodes if by_episode else progress.frames,
+            unit="episode" if by_episode else "frame",
             desc="train",
             dynamic_ncols=True,
             mininterval=1.0,
+            postfix=self.window.short(),
         )
         batches = iter(self.collector)
-        try:
-            while self.budget.spent(progress.frames, progress.episodes) < 1.0:
+        with self._open_loggers(), _interrupts() as interrupted, bar:
+            while self.spent < 1.0 and not interrupted:
                 with self.clock.phase("collect"):
                     data = next(batches)
-                self._take(data)
-                bar.update((progress.episodes if self.budget.episodes else progress.frames) - bar.n)
+                if len(self._take(data)):
+                    bar.set_postfix(self.window.short(), refresh=False)
+                bar.update((progress.episodes if by_episode else progress.frames) - bar.n)
                 if progress.frames - progress.last_record >= self.record_every:
                     self._record()
-                    bar.set_postfix(self.window.short())
-                if progress.frames - progress.last_save >= self.save_every:
+                if progress.frames - progress.last_save >= self.save_every and self.spent < 1.0:
                     self.save()
-        except KeyboardInterrupt:
-            log.warning("Interrupted at frame %d: saving a checkpoint.", progress.frames)
-            self.save()
-            raise
-        finally:
-            bar.close()
-        self._record()
+            if interrupted:
+                self.save()
+                raise KeyboardInterrupt(
+                    f"Interrupted at frame {progress.frames}. Continue with resume={self.run}"
+                )
+            if progress.frames > progress.last_record:
+                self._record()
         self.save()
 
-    def save(self) -> Path:
-        """Write a checkpoint of everything."""
-        self.progress.last_save = self.progress.frames
-        return self.checkpoint.save(self.progress.frames, {"episodes": self.progress.episodes})
+    @contextmanager
+    def _open_loggers(self) -> Iterator[None]:
+        """TorchRL's loggers have no end of their own; what they write to does."""
+        try:
+            yield
+        finally:
+            for logger in self.loggers:
+                sink = logger.experiment
+                end = getattr(sink, "close", None) or getattr(sink, "finish", None)
+                if end is not None:
+                    end()
 
-    def _take(self, data: TensorDictBase) -> None:
-        """Store a batch, make the updates it entitles to, and tell who waits for episodes."""
+    def save(self) -> None:
+        """Write a checkpoint of everything, unless the newest one is of this very frame."""
+        if self.progress.last_save < self.progress.frames:
+            self.progress.last_save = self.progress.frames
+            self.checkpoint.save(self.progress.frames, {"episodes": self.progress.episodes})
+
+    def _take(self, data: TensorDictBase) -> TensorDict:
+        """Store a batch and make the updates it entitles to; returns its finished episodes [n]."""
         progress = self.progress
         finished = self.window.extend(data)
         progress.frames += data.numel()
         progress.episodes += finished.shape[0]
-        spent = self.budget.spent(progress.frames, progress.episodes)
         self.buffer.extend(data.select(*self.stored, strict=False).contiguous().reshape(-1))
         for hook in self.after_collect:
-            hook(finished, spent)
+            hook(finished, self.spent)
         if progress.frames < self.warmup_frames:
-            return
+            return finished
         with self.clock.phase("learn"):
-            self.learner.schedule(spent)
+            self.learner.schedule(self.spent)
             progress.owed += data.numel() * self.updates_per_frame
             while progress.owed >= 1.0:
                 progress.owed -= 1.0
                 progress.updates += 1
                 self._add(self.learner.update(self.buffer.sample()))
+        return finished
 
     def _add(self, losses: TensorDictBase) -> None:
         for key, value in losses.items():

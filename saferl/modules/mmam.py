@@ -9,9 +9,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-EGO_SCALE = (1.0, 50.0, 50.0, 10.0, 10.0, math.pi, 1.0, 50.0, 100.0)
+EGO_SCALE = (1.0, 10.0, 10.0, 10.0, 2.0, 1.0, 1.0, 20.0, 50.0)
 """Divisors of the ego features (I_veh, x, y, v_x, v_y, phi, omega, d_veh, d_des)."""
-VEHICLE_SCALE = (1.0, 50.0, 50.0, 10.0, 10.0, math.pi)
+VEHICLE_SCALE = (1.0, 20.0, 20.0, 10.0, 10.0, 1.0)
 """Divisors of a vehicle's features (I_veh, dx, dy, dv_x, dv_y, phi)."""
 
 _MASKED = -1e9

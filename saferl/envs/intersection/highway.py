@@ -14,8 +14,14 @@ from saferl.envs.intersection.base import STANDING, SUBSTEPS, Scenario
 from saferl.envs.intersection.batched import draw_route, draw_start
 from saferl.envs.intersection.cost import CollisionCost
 from saferl.envs.intersection.dynamics import to_physical
-from saferl.envs.intersection.geometry import ROUTES, ROUTES_OF_TASK, TASK_OF_ROUTE, TASKS
-from saferl.envs.intersection.geometry import arrived, offroad
+from saferl.envs.intersection.geometry import (
+    ROUTES,
+    ROUTES_OF_TASK,
+    TASK_OF_ROUTE,
+    TASKS,
+    arrived,
+    offroad,
+)
 from saferl.envs.intersection.network import rectangles_overlap
 from saferl.envs.intersection.observation import ROWS, observe
 from saferl.envs.intersection.regulation import IntersectionRoad
@@ -61,7 +67,7 @@ class IntersectionEnv(gymnasium.Env):
     ((11, 6), False)
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 5}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012
 
     def __init__(
         self,
@@ -96,13 +102,13 @@ class IntersectionEnv(gymnasium.Env):
             }
         )
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
-        self.road: IntersectionRoad | None = None
+        self.road = IntersectionRoad()
         self._renderer: Renderer | None = None
 
     @property
     def ego(self) -> EgoVehicle:
         """The ego vehicle of the running episode."""
-        if self.road is None or self.road.ego is None:
+        if self.road.ego is None:
             raise gymnasium.error.ResetNeeded("reset the environment first.")
         return self.road.ego
 
@@ -140,9 +146,7 @@ class IntersectionEnv(gymnasium.Env):
         start = torch.as_tensor(start, dtype=torch.float64)
         if start.shape != (6,):
             raise ValueError(f"options.start must have shape (6,), got {tuple(start.shape)}.")
-        if self.road is None:
-            self.road = IntersectionRoad(self.np_random)
-        self.road.np_random = self.np_random
+        self.road.np_random = self.np_random  # pyright: ignore[reportAttributeAccessIssue]
         ego = EgoVehicle(self.road, start, int(self._route))
         traffic = draw_traffic(self.np_random, self.road.table, self.scenario.vehicles, ego)
         self.road.populate(ego, *traffic)
@@ -207,9 +211,10 @@ class IntersectionEnv(gymnasium.Env):
         """The scene [600, 600, 3] uint8 with ``render_mode="rgb_array"``, else None."""
         if self.render_mode is None:
             return None
+        if self.road.ego is None:
+            raise gymnasium.error.ResetNeeded("reset the environment before rendering it.")
         if self._renderer is None:
             self._renderer = Renderer()
-        _ = self.ego
         return self._renderer.draw(self.road)
 
     def close(self) -> None:
@@ -220,8 +225,10 @@ class IntersectionEnv(gymnasium.Env):
 def register() -> None:
     """Make ``saferl/Intersection-{LT,GS,RT,Mixed}-v0`` known to ``gymnasium.make``."""
     for name, task in (("LT", "lt"), ("GS", "gs"), ("RT", "rt"), ("Mixed", "mixed")):
-        gymnasium.register(
-            id=f"saferl/Intersection-{name}-v0",
-            entry_point="saferl.envs.intersection.highway:IntersectionEnv",
-            kwargs={"task": task},
-        )
+        key = f"saferl/Intersection-{name}-v0"
+        if key not in gymnasium.registry:
+            gymnasium.register(
+                id=key,
+                entry_point="saferl.envs.intersection.highway:IntersectionEnv",
+                kwargs={"task": task},
+            )

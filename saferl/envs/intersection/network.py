@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from highway_env.road.lane import CircularLane, LineType, StraightLane
@@ -35,6 +36,8 @@ def build_network() -> RoadNetwork:
     """
     network = RoadNetwork()
     none, line, striped = LineType.NONE, LineType.CONTINUOUS, LineType.STRIPED
+    blank: Any = (none, none)
+    curb: Any = (none, line)
     end = HALF_BOX + ARM
     for arm in range(4):
         angle = np.pi / 2 * arm
@@ -43,18 +46,16 @@ def build_network() -> RoadNetwork:
         rotation = np.array([[cos, -sin], [sin, cos]])
         node, left, ahead, right = (f"{arm}", *(f"il{(arm + k) % 4}" for k in (1, 2, 3)))
 
-        def straight(start, stop, lines, level=priority, rotation=rotation):
+        def straight(start, stop, lines: Any, level=priority, rotation=rotation):
             return StraightLane(
                 rotation @ np.array(start), rotation @ np.array(stop), line_types=lines,
                 priority=level, speed_limit=SPEED_LIMIT,
             )  # fmt: skip
 
         for lane, x in enumerate((LANE_WIDTH / 2, 3 * LANE_WIDTH / 2)):
-            edge = (line, striped) if lane == 0 else (none, line)
+            edge = (line, striped) if lane == 0 else curb
             network.add_lane("o" + node, "ir" + node, straight((x, end), (x, HALF_BOX), edge))
-            network.add_lane(
-                "ir" + node, ahead, straight((x, HALF_BOX), (x, -HALF_BOX), (none, none))
-            )
+            network.add_lane("ir" + node, ahead, straight((x, HALF_BOX), (x, -HALF_BOX), blank))
             # The exit of the arm itself, on the other side of its middle line.
             network.add_lane("il" + node, "o" + node, straight((-x, HALF_BOX), (-x, end), edge))
         network.add_lane(
@@ -62,7 +63,7 @@ def build_network() -> RoadNetwork:
             left,
             CircularLane(
                 rotation @ np.array([-HALF_BOX, HALF_BOX]), _LEFT_RADIUS, angle, angle - np.pi / 2,
-                clockwise=False, line_types=(none, none), priority=priority - 1,
+                clockwise=False, line_types=blank, priority=priority - 1,
                 speed_limit=TURN_SPEED["left"],
             ),
         )  # fmt: skip
@@ -71,7 +72,7 @@ def build_network() -> RoadNetwork:
             right,
             CircularLane(
                 rotation @ np.array([HALF_BOX, HALF_BOX]), _RIGHT_RADIUS, angle + np.pi,
-                angle + 1.5 * np.pi, line_types=(none, line), priority=priority,
+                angle + 1.5 * np.pi, line_types=curb, priority=priority,
                 speed_limit=TURN_SPEED["right"],
             ),
         )  # fmt: skip
@@ -111,7 +112,7 @@ class Routes:
     approach: np.ndarray
     zone: np.ndarray
 
-    def pose(self, route: np.ndarray, s: np.ndarray) -> np.ndarray:
+    def pose(self, route: np.ndarray | int, s: np.ndarray | float) -> np.ndarray:
         """Pose [..., 3] (x, y, heading) at arc lengths ``s`` [...] m of ``route`` [...]."""
         before = np.minimum(s, ARM)
         half = np.clip(s - ARM, 0.0, self.out[route] - ARM) / 2
@@ -140,7 +141,7 @@ class Routes:
         """Curvature [...] of the routes at arc lengths ``s`` [...], 1/m."""
         return np.where((s > ARM) & (s < self.out[route]), self.curvature[route], 0.0)
 
-    def project(self, route: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def project(self, route: np.ndarray | int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Arc length and lateral offset [..., P] (m, positive to the right) of points [..., P, 2].
 
         ``route`` [...] is broadcast against the points' leading dimensions.
@@ -227,21 +228,20 @@ def routes() -> Routes:
         for arm in range(4)
         for turn, (_, lane) in zip((1, 2, 2, 3), MOVEMENTS, strict=True)
     ]
-    first, box, last = (
-        [network.get_lane(indexes[k]) for indexes in lanes] for k in range(3)
-    )  # fmt: skip
+    first, box, last = ([network.get_lane(indexes[k]) for indexes in lanes] for k in range(3))
     table = {
         "start": np.array([lane.position(0, 0) for lane in first]),
         "middle": np.array([lane.position(0, 0) for lane in box]),
         "leave": np.array([lane.position(0, 0) for lane in last]),
-        "heading": np.array([lane.heading for lane in first]),
-        "turned": np.array([lane.heading for lane in last]),
-        "curvature": np.array([getattr(b, "direction", 0) / b.radius
-                               if isinstance(b, CircularLane) else 0.0 for b in box]),
+        "heading": np.array([lane.heading_at(0) for lane in first]),
+        "turned": np.array([lane.heading_at(0) for lane in last]),
+        "curvature": np.array(
+            [b.direction / b.radius if isinstance(b, CircularLane) else 0.0 for b in box]
+        ),
         "out": np.array([ARM + lane.length for lane in box]),
-        "priority": np.array([lane.priority for lane in box]),
-        "turn_speed": np.array([lane.speed_limit for lane in box]),
+        "priority": np.array([getattr(lane, "priority") for lane in box]),  # noqa: B009
+        "turn_speed": np.array([TURN_SPEED[movement] for movement, _ in MOVEMENTS] * 4),
         "approach": np.array([2 * (k // 4) + MOVEMENTS[k % 4][1] for k in range(16)]),
-    }  # fmt: skip
+    }
     bare = Routes(lanes=lanes, zone=np.empty(0), **table)
     return Routes(lanes=lanes, zone=_zones(bare), **table)

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 from highway_env.road.regulation import RegulatedRoad
+from highway_env.road.road import RoadNetwork
 
-from saferl.envs.intersection.geometry import ARM, LENGTH, TASK_OF_ROUTE, WIDTH
+from saferl.envs.intersection.geometry import ARM, LENGTH, WIDTH
 from saferl.envs.intersection.network import build_network, rectangles_overlap, routes
 from saferl.envs.intersection.traffic import EgoVehicle, RouteVehicle
 
@@ -38,11 +39,12 @@ class IntersectionRoad(RegulatedRoad):
        it. Entered vehicles never yield to vehicles that have not, so the box clears.
     2. Of the vehicles that have not entered only the first on each lane decides. It waits at the
        line while an entered vehicle on a crossing route would meet it in the zone that both sweep,
-       and while the predicted rectangles (2 s at constant speed) meet those of a vehicle of higher
-       rank that does not wait itself.
+       and while it would hit a vehicle of higher rank that does not wait itself: because their
+       rectangles meet within 2 s (paper), or because both are due in their zone at the same time.
     3. Rank: entered vehicles in order of entry, then road priority, then time to the line. It is a
        total order, so no two vehicles ever wait for each other.
-    4. Two entered vehicles bound for the same zone: the later one brakes before it.
+    4. Two entered vehicles bound for the same zone: the later one brakes before it, unless it is
+       already there and the other is not.
     5. The ego counts as a vehicle of its rank, predicted along its route at constant speed; any
        body in a vehicle's corridor ahead is a leader, whatever lane it is on.
 
@@ -54,8 +56,8 @@ class IntersectionRoad(RegulatedRoad):
         held: [N] bool, waits at the entry line; stop: [N] arc length where it must stop, or inf.
     """
 
-    def __init__(self, np_random: np.random.Generator | None = None, network=None):
-        super().__init__(network or build_network(), [], [], np_random or np.random.default_rng())
+    def __init__(self, network: RoadNetwork | None = None):
+        super().__init__(network or build_network(), [], [])
         self.table = routes()
         self.populate(None, np.zeros(0, int), np.zeros(0), np.zeros(0))
 
@@ -86,89 +88,100 @@ class IntersectionRoad(RegulatedRoad):
         out[:, 5] = self.speed * self.table.bend(self.route, self.s)
         return out
 
-    def _ego_on_route(self) -> tuple[int, float, float, float]:
-        """The ego's route among the 16, arc length, lateral offset and speed along the route."""
+    def _everyone(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Routes, arc lengths (m) and speeds along them (m/s), each [N], or [N + 1] with the ego
+        last."""
+        if self.ego is None:
+            return self.route, self.s, self.speed
         ego = self.ego
-        s, lateral = self.table.project(ego.route_id, ego.position[None])
-        heading = self.table.pose(ego.route_id, s)[0, 2]
-        return ego.route_id, s[0], lateral[0], max(ego.speed * np.cos(ego.heading - heading), 0.0)
+        s, _ = self.table.project(ego.route_id, ego.position[None])
+        turned = ego.heading - self.table.pose(ego.route_id, s)[0, 2]
+        pace = max(ego.speed * np.cos(turned), 0.0)
+        return (
+            np.append(self.route, ego.route_id),
+            np.append(self.s, s),
+            np.append(self.speed, pace),
+        )
+
+    def _predict(self, route: np.ndarray, s: np.ndarray, pace: np.ndarray) -> np.ndarray:
+        """Poses [total, T, 3] along the routes at constant speed, every vehicle once.
+
+        The ego keeps its distance and angle to its route.
+        """
+        path = self.table.pose(route[:, None], s[:, None] + pace[:, None] * TIMES)
+        if self.ego is not None:
+            x, y, heading = self.table.pose(route[-1], s[-1])
+            lateral = (self.ego.position[1] - y) * np.cos(heading) - (
+                self.ego.position[0] - x
+            ) * np.sin(heading)
+            path[-1, :, 0] -= lateral * np.sin(path[-1, :, 2])
+            path[-1, :, 1] += lateral * np.cos(path[-1, :, 2])
+            path[-1, :, 2] += self.ego.heading - heading
+        return path
+
+    def _entries(self, s: np.ndarray, speed: np.ndarray, present: np.ndarray) -> np.ndarray:
+        """Times [total] at which vehicles entered, s; inf for those that have not or have left."""
+        total = len(s)
+        to_line = ARM - LENGTH / 2 - s
+        held = np.append(self.held, False)[:total]
+        unable = ~held & (speed**2 > 2 * COMMIT * (to_line - 0.5))
+        inside = present & ((to_line < 0) | unable)
+        self.entered[:total] = np.where(inside, np.minimum(self.entered[:total], self.time), np.inf)
+        return self.entered[:total]
 
     def enforce_road_rules(self) -> None:
         """Decide which vehicles wait at the line or brake in the box; writes ``held``, ``stop``."""
         table, count = self.table, len(self.s)
-        route, s, speed = self.route, self.s, self.speed
-        if self.ego is not None:
-            e_route, e_s, e_lateral, e_speed = self._ego_on_route()
-            route, s, speed = (
-                np.append(route, e_route),
-                np.append(s, e_s),
-                np.append(speed, e_speed),
-            )
-            held = np.append(self.held, False)
-        else:
-            held = self.held
+        route, s, speed = self._everyone()
         total = len(s)
-        to_line = ARM - LENGTH / 2 - s
         present = s < table.out[route] + LENGTH / 2  # not yet out of the box
-        unable = ~held & (speed**2 > 2 * COMMIT * (to_line - 0.5))
-        inside = present & ((to_line < 0) | unable)
-        entered = np.where(inside, np.minimum(self.entered[:total], self.time), np.inf)
-        self.entered[:total] = entered
-        if self.ego is None:
-            self.entered[-1] = np.inf
+        entered = self._entries(s, speed, present)
+        inside = np.isfinite(entered)
 
-        arrival = np.minimum(np.maximum(to_line, 0) / np.maximum(speed, 1.0), 900.0)
-        rank = table.priority[route] * 1e3 - arrival
-        rank = np.where(inside, 1e6 - np.where(inside, entered, 0.0), rank)
-        import os
-        if os.environ.get("VAR") and speed[-1] > 1.0:
-            rank[-1] = table.priority[route[-1]] * 1e3 - arrival[-1]
-        rank = rank + s * 1e-6 - np.arange(total) * 1e-9
+        arrival = np.maximum(ARM - LENGTH / 2 - s, 0.0) / np.maximum(speed, 1.0)
+        rank = np.where(
+            inside, 1e6 - np.where(inside, entered, 0.0), table.priority[route] * 1e3 - arrival
+        )
+        rank += s * 1e-6 - np.arange(total) * 1e-9  # no ties
 
         # The first vehicle on each approach lane that has not entered.
         waiting = present & ~inside
         same = table.approach[route][:, None] == table.approach[route]
         head = waiting & ~(same & waiting & (s > s[:, None])).any(1)
 
-        go = np.maximum(speed, GO_SPEED)
-        if self.ego is not None:
-            go[-1] = speed[-1]
-        path = table.pose(route[:, None], s[:, None] + go[:, None] * TIMES)  # [total, T, 3]
-        if self.ego is not None:
-            path[-1, :, 0] -= e_lateral * np.sin(path[-1, :, 2])
-            path[-1, :, 1] += e_lateral * np.cos(path[-1, :, 2])
-            path[-1, :, 2] += self.ego.heading - table.pose(e_route, np.float64(e_s))[2]
-        meet = rectangles_overlap(path[:, None], path, STRETCH * LENGTH, WIDTH).any(-1) & ~same
+        pace = np.maximum(speed, GO_SPEED)
+        pace[count:] = speed[count:]
+        path = self._predict(route, s, pace)
+        hit = rectangles_overlap(path[:, None], path, STRETCH * LENGTH, WIDTH)
+        meet = np.any(hit, axis=-1) & ~same
+        clash = self._clashes(pace[:count])
 
-        clash = self._clashes(route, s, speed, go)
-        blocked = (clash & inside[:count]).any(1) if count else np.zeros(0, bool)
+        blocked = np.any(clash & inside[:count], axis=1)
+        meet[:count, :count] |= clash
         free = np.zeros(total, bool)
-        if self.ego is not None:
-            free[-1] = present[-1]
-        new_held = np.zeros(count, bool)
+        free[count:] = present[count:]
+        self.held = np.zeros(count, bool)
         for i in np.argsort(-rank):
             if i < count and head[i]:
-                new_held[i] = blocked[i] or (meet[i] & free & (rank > rank[i])).any()
-                free[i] = not new_held[i]
-        self.held = new_held
+                self.held[i] = blocked[i] or (meet[i] & free & (rank > rank[i])).any()
+                free[i] = not self.held[i]
         stop = self._stops_in_box(route, s, rank, inside, clash, meet)
-        self.stop = np.where(new_held, STOP, stop)
+        self.stop = np.where(self.held, STOP, stop)
         for vehicle, yields in zip(self.traffic, self.held, strict=True):
             vehicle.is_yielding = bool(yields)
 
-    def _clashes(self, route, s, speed, go) -> np.ndarray:
-        """[N, N]: would vehicles i and j be in the zone of their routes at the same time?"""
-        count = len(self.s)
-        route, s, speed, go = route[:count], s[:count], speed[:count], go[:count]
+    def _clashes(self, pace: np.ndarray) -> np.ndarray:
+        """[N, N]: would vehicle i, at ``pace`` [N] m/s, meet j in the zone of their routes?"""
+        route, s = self.route, self.s
         mine = self.table.zone[route[:, None], route]
         other = mine.transpose(1, 0, 2)
         crossing = np.isfinite(mine[..., 0]) & (s[:, None] < mine[..., 1]) & (s < other[..., 1])
         with np.errstate(invalid="ignore"):
-            begin = (mine[..., 0] - s[:, None]) / go[:, None]
-            end = (mine[..., 1] - s[:, None]) / go[:, None]
-            pace = np.maximum(speed, 0.5)
-            other_begin = np.maximum(other[..., 0] - s, 0.0) / pace
-            other_end = (other[..., 1] - s) / pace
+            begin = (mine[..., 0] - s[:, None]) / pace[:, None]
+            end = (mine[..., 1] - s[:, None]) / pace[:, None]
+            other_pace = np.maximum(self.speed, 0.5)
+            other_begin = np.maximum(other[..., 0] - s, 0.0) / other_pace
+            other_end = (other[..., 1] - s) / other_pace
         return crossing & (begin < other_end + TIME_MARGIN) & (other_begin < end + TIME_MARGIN)
 
     def _stops_in_box(self, route, s, rank, inside, clash, meet) -> np.ndarray:

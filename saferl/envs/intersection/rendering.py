@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,28 +25,28 @@ class Renderer:
     """
 
     def __init__(self, size: int = SIZE, view: float = VIEW):
-        # pygame asks SDL for a video driver as soon as graphics are imported and used.
+        # No display is opened; this keeps SDL from looking for one.
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         import pygame
         from highway_env.road.graphics import WorldSurface
 
-        self.surface = WorldSurface((size, size), 0, pygame.Surface((size, size)))
+        canvas: Any = pygame.Surface((size, size))
+        self.surface = WorldSurface((size, size), 0, canvas)
         self.surface.scaling = size / (2 * view)
         self.surface.centering_position = [0.5, 0.5]
         self.surface.move_display_window_to(np.zeros(2))
-        self._background = None
+        self._background: Any = None
 
-    def _draw_background(self, road: IntersectionRoad) -> None:
+    def _draw_background(self, road: IntersectionRoad) -> Any:
         import pygame
         from highway_env.road.graphics import LaneGraphics
 
-        from saferl.envs.intersection.geometry import CURB_RADIUS, HALF_BOX, LANE_WIDTH
+        from saferl.envs.intersection.geometry import ARM, CURB_RADIUS, HALF_BOX, LANE_WIDTH
 
         surface, half = self.surface, 2 * LANE_WIDTH
         surface.fill(_GRASS)
         pix = surface.vec2pix
-        far = 2 * VIEW
+        far = HALF_BOX + ARM
         for (x, y), (w, h) in (
             ((-half, -far), (2 * half, 2 * far)),
             ((-far, -half), (2 * far, 2 * half)),
@@ -59,7 +59,7 @@ class Renderer:
                 pygame.draw.circle(surface, _GRASS, pix((x, y)), surface.pix(CURB_RADIUS))
         for lane in road.network.lanes_list():
             LaneGraphics.display(lane, surface)
-        self._background = surface.copy()
+        return surface.copy()
 
     def draw(self, road: IntersectionRoad) -> np.ndarray:
         """The scene as it is now; yielding vehicles are orange, the ego is green."""
@@ -67,10 +67,8 @@ class Renderer:
         from highway_env.vehicle.graphics import VehicleGraphics
 
         if self._background is None:
-            self._draw_background(road)
+            self._background = self._draw_background(road)
         self.surface.blit(self._background, (0, 0))
         for vehicle in road.vehicles:
             VehicleGraphics.display(vehicle, self.surface, offscreen=True)
-        return np.ascontiguousarray(
-            np.moveaxis(pygame.surfarray.array3d(self.surface), 0, 1)
-        )  # fmt: skip
+        return np.ascontiguousarray(np.moveaxis(pygame.surfarray.array3d(self.surface), 0, 1))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from highway_env.road.road import Road
@@ -53,13 +55,14 @@ class RouteVehicle(IDMVehicle):
 
     def __init__(self, road: Road, route_id: int, s: float, speed: float, table: Routes):
         # Without a road the base class does not search every lane for the closest one.
-        super().__init__(None, [0.0, 0.0], speed=speed, enable_lane_change=False, timer=0.0)
+        nowhere: Any = None
+        super().__init__(nowhere, [0.0, 0.0], speed=speed, enable_lane_change=False, timer=0.0)
         self.road, self.table, self.route_id = road, table, int(route_id)
         self.route = list(table.lanes[route_id])
         self.desired_speed = float(speed)
         self.is_yielding = False
         self.lane_index = None
-        self.follow(s, speed, 0.0, table.pose(route_id, np.float64(s)))
+        self.follow(s, speed, 0.0, table.pose(route_id, s))
 
     def follow(self, s: float, speed: float, acceleration: float, pose: np.ndarray) -> None:
         """Take the place at arc length ``s`` with ``pose`` [3]; keeps lane and route up to date."""
@@ -105,7 +108,8 @@ class EgoVehicle(Vehicle):
     COLOR = (50, 200, 0)
 
     def __init__(self, road: Road, state: Tensor, route: int):
-        super().__init__(None, [0.0, 0.0])
+        nowhere: Any = None
+        super().__init__(nowhere, [0.0, 0.0])
         self.road, self.route_id = road, int(route)
         self.color = self.COLOR
         self.control = torch.zeros(2, dtype=torch.float64)

@@ -1,0 +1,194 @@
+"""The commands, on configurations that Hydra has composed: train, evaluate, export."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+import hydra
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs.transforms import Transform
+
+from saferl import checkpoint
+from saferl.builders import build_env, build_trainer, load_agent
+from saferl.checkpoint import CONFIG, run_folder
+from saferl.envs.intersection import Scenario
+from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver
+from saferl.evaluation import as_test, write
+from saferl.evaluation import evaluate as play_episodes
+from saferl.metrics import table
+from saferl.paths import pretrained_run
+from saferl.validation import check_testing
+
+log = logging.getLogger(__name__)
+DRIVERS = {"random": RandomDriver, "blind": Driver, "scripted": CautiousDriver}
+
+
+def train(cfg: DictConfig) -> None:
+    """Train, or continue a run, then test the result."""
+    if cfg.resume is None:
+        run = Path(HydraConfig.get().runtime.output_dir)
+        if (run / "metrics.csv").exists() or (run / checkpoint.FOLDER).exists():
+            raise ValueError(
+                f"out: {run} holds a run already; continue it with resume={run}, or take another "
+                "folder."
+            )
+        OmegaConf.resolve(cfg)
+        trainer = build_trainer(cfg, run)
+        run.mkdir(parents=True, exist_ok=True)
+        OmegaConf.save(cfg, run / CONFIG)
+    else:
+        others = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]
+        if others:
+            raise ValueError(
+                "resume continues a run as it was configured and takes no other option, "
+                f"got {', '.join(others)}."
+            )
+        run = run_folder(Path(cfg.resume), "resume")
+        cfg = run_config(run)
+        trainer = build_trainer(cfg, run)
+        trainer.resume()
+    log.info("%s on %s, seed %d. Files: %s", cfg.algo_name, cfg.task.task, cfg.seed, run)
+    trainer.train()
+
+    settings = cfg.evaluation
+    test(
+        cfg,
+        as_test(hydra.utils.instantiate(cfg.task), settings.policy_frequency),
+        *trained_policy(cfg, run),
+        out=run / "evaluation",
+        num_envs=settings.num_envs,
+        episodes=settings.episodes,
+        seed=cfg.seed,
+        policy_name=cfg.algo_name,
+    )
+
+
+def evaluate(cfg: DictConfig) -> None:
+    """Test a policy that the configuration names, and draw its first episodes."""
+    check_testing(cfg)
+    torch.set_num_threads(cfg.threads)
+    OmegaConf.resolve(cfg)
+    scenario = hydra.utils.instantiate(cfg.task)
+    policy, transforms, name = choose_policy(cfg)
+    out = Path(HydraConfig.get().runtime.output_dir)
+    rows = test(
+        cfg,
+        scenario,
+        policy,
+        transforms,
+        out=out,
+        num_envs=cfg.env.num_envs,
+        episodes=cfg.episodes,
+        seed=cfg.seed,
+        policy_name=name,
+    )
+    if cfg.gif:
+        from saferl.plotting import draw  # late: few tests want pictures
+
+        env = build_env(cfg, scenario, 1, cfg.seed, *transforms)
+        for row in rows[: cfg.gif]:
+            log.info("%s", draw(policy, env, row, out))
+
+
+def export(cfg: DictConfig) -> None:
+    """Reduce a run to its configuration and networks."""
+    for key in ("checkpoint", "out"):
+        if cfg[key] is None:
+            raise ValueError(f"{key}=... is missing: give checkpoint=RUN and out=DIR.")
+    folder = checkpoint.export(Path(cfg.checkpoint), Path(cfg.out))
+    size = (folder / checkpoint.EXPORTED).stat().st_size / 2**20
+    log.info("%s: %.1f MiB. Test it: python -m saferl.evaluate checkpoint=%s", folder, size, folder)
+
+
+def run_config(path: Path, option: str = "checkpoint") -> DictConfig:
+    """The resolved configuration that a run was trained with.
+
+    Raises:
+        FileNotFoundError: it is not there.
+    """
+    cfg = OmegaConf.load(run_folder(path, option) / CONFIG)
+    assert isinstance(cfg, DictConfig)
+    return cfg
+
+
+def trained_policy(cfg: DictConfig, path: Path) -> tuple[TensorDictModuleBase, list[Transform]]:
+    """The policy of a run or checkpoint, with the projector that it drives with.
+
+    Args:
+        cfg: the run's configuration.
+        path: the run or checkpoint.
+    """
+    agent = load_agent(cfg, path, "checkpoint")
+    if agent.projector is None:
+        return agent.actor, []
+    agent.projector.set_progress(1.0)
+    return agent.actor, [agent.projector]
+
+
+def choose_policy(cfg: DictConfig) -> tuple[TensorDictModuleBase, list[Transform], str]:
+    """The policy that a test names, the transforms that it drives with, and what to call it.
+
+    Raises:
+        ValueError: not exactly one source, an unknown name, or an MLP for other observations.
+    """
+    given = {key: cfg[key] for key in ("checkpoint", "pretrained", "policy") if cfg[key] is not None}
+    if len(given) != 1:
+        got = " and ".join(f"{key}={value}" for key, value in given.items()) or "none of them"
+        raise ValueError(
+            "Give one of checkpoint=PATH, pretrained=NAME or policy=random|blind|scripted, "
+            f"got {got}."
+        )
+    ((source, name),) = given.items()
+    if source == "policy":
+        if name not in DRIVERS:
+            raise ValueError(f"policy must be one of {', '.join(DRIVERS)}, got {name!r}.")
+        return DRIVERS[name](**({"seed": cfg.seed} if name == "random" else {})), [], name
+    path = pretrained_run(name) if source == "pretrained" else Path(name)
+    trained = run_config(path, source)
+    trained.device = cfg.device
+    rows = trained.encoder.policy.get("rows", cfg.task.rows)
+    if rows != cfg.task.rows:
+        raise ValueError(
+            f"task.rows must be {rows}, the number that this policy's MLP was trained with, "
+            f"got {cfg.task.rows}."
+        )
+    policy, transforms = trained_policy(trained, path)
+    return policy, transforms if cfg.projector else [], f"{trained.algo_name} ({name})"
+
+
+def test(
+    cfg: DictConfig,
+    scenario: Scenario,
+    policy: TensorDictModuleBase,
+    transforms: Sequence[Transform],
+    *,
+    out: Path,
+    num_envs: int,
+    episodes: int,
+    seed: int,
+    policy_name: str,
+) -> list[dict]:
+    """Play, write ``metrics.json`` and ``episodes.csv``, report the table; returns the rows."""
+    env = build_env(cfg, scenario, min(num_envs, episodes), seed, *transforms)
+    rows = play_episodes(policy, env, episodes, seed)
+    for transform in transforms:  # free for another environment
+        transform.reset_parent()
+    backend = cfg.env._target_.rpartition(".")[2]
+    figures = write(
+        rows,
+        out,
+        policy=policy_name,
+        task=scenario.task,
+        env=backend,
+        vehicles=scenario.vehicles,
+        episodes=episodes,
+        seed=seed,
+    )
+    title = f"{policy_name}: {episodes} episodes of {scenario.task}, {scenario.vehicles} vehicles"
+    log.info("\n%s\nFiles: %s", table(figures, title), out)
+    return rows

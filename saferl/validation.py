@@ -1,0 +1,212 @@
+"""Refuse a configuration that cannot be meant, before anything is built from it."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin
+
+import hydra
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+from saferl.paths import config_dir
+
+_KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+_KINDS |= {NoneType: "null"}
+
+#: Kind, lowest and highest value of each number that no class checks itself.
+TRAINING = {
+    "seed": (int, 0, 2**31 - 1),
+    "threads": (int, 1, math.inf),
+    "compile": (bool, 0, 1),
+    "episodes": (int | None, 1, math.inf),
+    "frames": (int | None, 1, math.inf),
+    "gamma": (float, 0.0, 1.0),
+    "cost_limit": (float, 0.0, math.inf),
+    "batch_size": (int, 1, math.inf),
+    "buffer_size": (int, 1, math.inf),
+    "warmup_frames": (int, 1, math.inf),
+    "updates_per_frame": (float, 0.0, math.inf),
+    "reward_scale": (float, 0.0, math.inf),
+    "tau": (float, 0.0, 1.0),
+    "target_entropy": (Union[Literal["auto"], float], -math.inf, math.inf),
+    "alpha_init": (float, 0.0, math.inf),
+    "record_every": (int, 1, math.inf),
+    "save_every": (int, 1, math.inf),
+    "evaluation.episodes": (int, 1, math.inf),
+    "evaluation.num_envs": (int, 1, math.inf),
+    "evaluation.policy_frequency": (int, 1, math.inf),
+    "collector.frames_per_env": (int, 1, math.inf),
+    "critic.members": (int, 1, math.inf),
+    "cost_critic.members": (int, 0, math.inf),
+    "init": (str | None, 0, 0),
+}
+POSITIVE = ("reward_scale", "tau", "alpha_init")
+TESTING = {
+    "episodes": (int, 1, math.inf),
+    "seed": (int, 0, 2**31 - 1),
+    "threads": (int, 1, math.inf),
+    "gif": (int, 0, math.inf),
+    "projector": (bool, 0, 1),
+    "checkpoint": (str | None, 0, 0),
+    "pretrained": (str | None, 0, 0),
+    "policy": (str | None, 0, 0),
+}
+
+
+def check_training(cfg: DictConfig) -> None:
+    """Check the configuration of a training run.
+
+    Raises:
+        ValueError: an unknown key, a value of another kind or out of range; names key, value and
+            what is allowed.
+    """
+    check_keys(cfg)
+    check_numbers(cfg, TRAINING)
+    for name, rates in cfg.lr.items():
+        pair = isinstance(rates, ListConfig) and len(rates) == 2
+        if not pair or not all(fits(rate, float) and 0 <= rate < math.inf for rate in rates):
+            raise ValueError(f"lr.{name} must be [first, last], both >= 0, got {rates!r}.")
+    if cfg.buffer_size < cfg.batch_size:
+        raise ValueError(
+            f"buffer_size must be >= batch_size, got {cfg.buffer_size} and {cfg.batch_size}."
+        )
+    check_targets(cfg)
+
+
+def check_testing(cfg: DictConfig) -> None:
+    """Check the configuration of a test.
+
+    Raises:
+        ValueError: as :func:`check_training`.
+    """
+    check_numbers(cfg, TESTING)
+    check_targets(cfg)
+
+
+def check_numbers(cfg: DictConfig, table: dict[str, tuple[Any, float, float]]) -> None:
+    """Check values against a table of kinds and ranges.
+
+    Raises:
+        ValueError: names the key, the value and what is allowed.
+    """
+    for key, (kind, low, high) in table.items():
+        value = OmegaConf.select(cfg, key)
+        within = not fits(value, float) or (
+            math.isfinite(value) and low <= value <= high and (value > 0 or key not in POSITIVE)
+        )
+        if fits(value, kind) and within:
+            continue
+        allowed = describe(kind)
+        if fits(0, kind) and low > -math.inf:
+            more = "> 0" if key in POSITIVE else f">= {low:g}"
+            allowed += f" {more}" if high == math.inf else f" {more} and <= {high:g}"
+        raise ValueError(f"{key} must be {allowed}, got {value!r}.")
+
+
+def check_keys(cfg: DictConfig) -> None:
+    """Refuse keys that no file of ``conf`` has, which is how a typo in an experiment shows.
+
+    Raises:
+        ValueError: names the key and those beside it.
+    """
+    root = Path(config_dir())
+    primary = OmegaConf.load(root / "config.yaml")
+    groups = {folder.name for folder in root.iterdir() if folder.is_dir()} - {"hydra"}
+    known = (set(primary) | groups | {"algo_name"}) - {"defaults", "hydra", "algo", "experiment"}
+    _refuse_unknown(cfg, known, "")
+    for name in ("lr", "evaluation"):
+        _refuse_unknown(cfg[name], set(primary[name]), f"{name}.")
+    for group in groups & set(cfg):
+        if isinstance(cfg[group], DictConfig) and "_target_" not in cfg[group]:
+            files = [OmegaConf.load(path) for path in (root / group).glob("*.yaml")]
+            _refuse_unknown(cfg[group], {key for file in files for key in file}, f"{group}.")
+
+
+def _refuse_unknown(node: DictConfig, known: set, prefix: str) -> None:
+    for key in node:
+        if key not in known:
+            raise ValueError(
+                f"unknown key {prefix}{key!s}; choose from {', '.join(sorted(map(str, known)))}."
+            )
+
+
+def check_targets(node: Any, path: str = "") -> None:
+    """Check each ``_target_`` below a node against its signature: names and kinds of arguments.
+
+    Raises:
+        ValueError: names the key and what is allowed.
+    """
+    if isinstance(node, ListConfig):
+        for index, item in enumerate(node):
+            check_targets(item, f"{path}[{index}]")
+    if not isinstance(node, DictConfig):
+        return
+    target = node.get("_target_")
+    accepted = None if target is None else _signature(target, path)
+    for key, value in node.items():
+        name = f"{path}.{key}".removeprefix(".")
+        if accepted is not None and not str(key).startswith("_"):
+            if key not in accepted:
+                raise ValueError(
+                    f"unknown key {name}: {target} takes {', '.join(accepted) or 'nothing'}."
+                )
+            if not isinstance(value, DictConfig) and not fits(value, accepted[key]):
+                raise ValueError(f"{name} must be {describe(accepted[key])}, got {value!r}.")
+        check_targets(value, name)
+
+
+def _signature(target: str, path: str) -> dict[str, Any] | None:
+    """Arguments and their annotations; None where it takes any."""
+    try:
+        function = hydra.utils.get_object(target)
+    except Exception as error:
+        raise ValueError(f"{path}._target_ names no class: {target!r}.") from error
+    try:
+        signature = inspect.signature(function, eval_str=True)
+    except NameError:  # annotations that exist for type checkers alone
+        signature = inspect.signature(function)
+    kinds = {parameter.kind for parameter in signature.parameters.values()}
+    if inspect.Parameter.VAR_KEYWORD in kinds:
+        return None
+    return {name: parameter.annotation for name, parameter in signature.parameters.items()}
+
+
+def fits(value: Any, kind: Any) -> bool:
+    """Whether a value is of an annotated kind; kinds that YAML cannot say fit everything.
+
+    >>> fits(3, float), fits("3", float), fits(True, int), fits([1, 2.5], tuple[float, float])
+    (True, False, False, True)
+    """
+    if kind in (int, float):
+        numbers = (int, float) if kind is float else int
+        return isinstance(value, numbers) and not isinstance(value, bool)
+    if kind in _KINDS or kind is None:
+        return isinstance(value, kind or NoneType)
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in (Union, UnionType):
+        return any(fits(value, option) for option in inner)
+    if origin is Literal:
+        return value in inner
+    if origin in (tuple, list, Sequence) and inner[0] in _KINDS:
+        listed = isinstance(value, (list, tuple, ListConfig))
+        return listed and all(fits(item, inner[0]) for item in value)
+    return True
+
+
+def describe(kind: Any) -> str:
+    """A kind in words.
+
+    >>> describe(int | None)
+    'a whole number or null'
+    """
+    if get_origin(kind) in (Union, UnionType):
+        return " or ".join(describe(option) for option in get_args(kind))
+    if get_origin(kind) is Literal:
+        return " or ".join(map(str, get_args(kind)))
+    if get_origin(kind) in (tuple, list, Sequence):
+        return f"a list, each {describe(get_args(kind)[0])}"
+    return _KINDS.get(kind, str(kind))

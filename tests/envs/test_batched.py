@@ -1,0 +1,425 @@
+"""The batched environment: specs, seeds, partial resets, ends of episodes, state."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
+
+from saferl.envs.intersection import BatchedIntersection, Scenario
+from saferl.envs.intersection.base import OUTCOMES, episode_seeds, mix, uniform
+from saferl.envs.intersection.batched import draw_route, draw_start
+from saferl.envs.intersection.geometry import ROUTES, ROUTES_OF_TASK, project, reference_lines
+
+NORTH = -math.pi / 2
+OBSERVATION = ("ego", "vehicles", "route", *OUTCOMES)
+COAST, BRAKE, HARD_LEFT = (0.0, 0.0), (-1.0, 0.0), (0.0, -1.0)
+
+
+def make(num_envs=1, seed=0, **settings):
+    return BatchedIntersection(Scenario(**{"vehicles": 0} | settings), num_envs, seed)
+
+
+def reset(env, seeds=None):
+    """Reset all environments, maybe to given episodes."""
+    fields = {"seed": torch.as_tensor(seeds)} if seeds is not None else {}
+    return env.reset(TensorDict(fields, batch_size=env.batch_size))
+
+
+def reset_rows(env, view, rows):
+    """Reset the environments in the mask ``rows``; ``view`` is what the last step gave."""
+    mask = torch.as_tensor(rows).reshape(*env.batch_size, 1)
+    return env.reset(view.exclude("reward", "cost").set("_reset", mask))
+
+
+def step(env, action):
+    """One step of all environments with ``action`` [2] or [B, 2]."""
+    action = torch.as_tensor(action).expand(*env.batch_size, 2)
+    return env.step(TensorDict({"action": action}, batch_size=env.batch_size))["next"]
+
+
+def equal(a, b, keys=OBSERVATION):
+    return all(torch.equal(a[key], b[key]) for key in keys)
+
+
+def noise(count, *shape, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand((count, *shape, 2), generator=generator) * 2 - 1
+
+
+# --- specs ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("num_envs", [1, 64])
+@pytest.mark.parametrize("task", ["lt", "gs", "rt", "mixed"])
+def test_specs(task, num_envs):
+    env = make(num_envs, task=task)
+    check_env_specs(env, seed=0)
+    rewards = env.full_reward_spec
+    assert set(rewards.keys()) == {"reward", "cost"}
+    for key in ("reward", "cost"):
+        assert rewards[key].shape == (num_envs, 1) and rewards[key].dtype == torch.float32
+    assert set(env.observation_spec.keys()) == set(OBSERVATION)
+    assert env.observation_spec["ego"].shape == (num_envs, 9)
+    assert env.observation_spec["vehicles"].shape == (num_envs, 11, 6)
+    assert env.action_spec.space.low.unique().item() == -1.0
+    assert env.action_spec.space.high.unique().item() == 1.0
+    fresh = env.reset()
+    assert not any(fresh[key].any() for key in OUTCOMES)
+
+
+def test_rows_are_a_setting():
+    env = make(2, rows=4)
+    check_env_specs(env, seed=0)
+    assert env.reset()["vehicles"].shape == (2, 4, 6)
+
+
+def test_traffic_is_refused():
+    with pytest.raises(ValueError, match=r"vehicles must be 0, got 10\. Use env=highway"):
+        BatchedIntersection(Scenario(vehicles=10))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"task": "uturn"}, "task must be one of lt, gs, rt, mixed, got 'uturn'"),
+        ({"vehicles": -1}, "vehicles must be >= 0, got -1"),
+        ({"rows": 0}, "rows must be >= 1, got 0"),
+        ({"policy_frequency": 0}, "policy_frequency must be > 0, got 0"),
+        ({"duration": 0.0}, "duration must be > 0 seconds, got 0.0"),
+        ({"route_starts": 1.5}, r"route_starts must be in \[0, 1\], got 1.5"),
+        ({"standstill": -2.0}, "standstill must be null or > 0 seconds, got -2.0"),
+    ],
+)
+def test_bad_settings_are_named(settings, message):
+    with pytest.raises(ValueError, match=message):
+        Scenario(**settings)
+
+
+def test_no_environment_is_refused():
+    with pytest.raises(ValueError, match="num_envs must be >= 1, got 0"):
+        make(0)
+
+
+# --- seeds ---------------------------------------------------------------------------------------
+
+
+def test_an_episode_is_a_function_of_its_seed_whatever_the_batch():
+    seeds = episode_seeds(5, 7)
+    actions = noise(30, 7)
+    together = make(7, task="mixed", seed=1)
+    views = [reset(together, seeds)] + [step(together, action) for action in actions]
+    for k in (0, 3, 6):
+        alone = make(1, task="mixed", seed=8)
+        assert equal(reset(alone, seeds[k : k + 1, None]), views[0][k : k + 1])
+        for action, view in zip(actions, views[1:], strict=True):
+            single = step(alone, action[k : k + 1])
+            for key in (*OBSERVATION, "reward", "cost", "done", "terminated", "truncated"):
+                expected = view[key][k : k + 1]
+                if expected.is_floating_point():
+                    # Vectorised arithmetic may round the last bit by the size of the batch.
+                    assert torch.allclose(single[key], expected, rtol=1e-5, atol=1e-4), key
+                else:
+                    assert torch.equal(single[key], expected), key
+    assert len({tuple(row.tolist()) for row in views[0]["ego"]}) == 7
+
+
+def test_set_seed_starts_the_same_sequence_of_episodes_again():
+    env = make(3, task="mixed", seed=4)
+    first = [reset(env)["ego"] for _ in range(4)]
+    env.set_seed(4)
+    again = [reset(env)["ego"] for _ in range(4)]
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    env.set_seed(5)
+    assert not torch.equal(reset(env)["ego"], first[0])
+    starts = torch.cat(first)[:, [2, 3]]  # y and v_x
+    assert len(torch.unique(starts, dim=0)) == 12, "every environment and episode is another one"
+
+
+def test_two_instances_share_no_generator_and_leave_the_global_one_alone():
+    def episodes(env, neighbour=None):
+        out = []
+        for k in range(3):
+            out.append(reset(env)["ego"])
+            if neighbour is not None:
+                reset(neighbour)
+                step(neighbour, COAST)
+                torch.rand(3, generator=torch.Generator().manual_seed(k))
+            out.append(step(env, (0.3, 0.1))["ego"])
+        return out
+
+    state = torch.get_rng_state()
+    alone = episodes(make(2, seed=3))
+    beside = episodes(make(2, seed=3), make(2, seed=3))
+    assert torch.equal(torch.get_rng_state(), state)
+    assert all(torch.equal(a, b) for a, b in zip(alone, beside, strict=True))
+
+
+def test_given_seeds_do_not_move_the_own_sequence():
+    plain, guided = make(2, seed=3), make(2, seed=3)
+    reset(guided, episode_seeds(0, 2))
+    assert equal(reset(plain), reset(guided))
+
+
+def test_hashed_numbers_are_uniform_and_independent():
+    seeds = episode_seeds(0, 20000)
+    assert len(seeds.unique()) > 19900 and seeds.min() >= 0 and seeds.max() < 2**31
+    first, second = uniform(seeds, 0), uniform(seeds, 1)
+    for numbers in (first, second, uniform(torch.arange(20000), 0)):
+        assert numbers.min() >= 0 and numbers.max() < 1
+        ordered = numbers.sort().values
+        expected = (torch.arange(20000, dtype=torch.float64) + 0.5) / 20000
+        assert (ordered - expected).abs().max() < 0.015  # Kolmogorov-Smirnov, p far below 1e-3
+    assert torch.corrcoef(torch.stack([first, second]))[0, 1].abs() < 0.03
+    assert torch.corrcoef(torch.stack([first[1:], first[:-1]]))[0, 1].abs() < 0.03
+
+
+def test_mix_is_splitmix64():
+    """The published first outputs of SplitMix64 seeded with 1234567."""
+    ours = [mix(torch.tensor(1234567), stream).item() % 2**64 for stream in range(5)]
+    assert ours == [
+        6457827717110365317,
+        3203168211198807973,
+        9817491932198370423,
+        4593380528125082431,
+        16408922859458223821,
+    ]
+
+
+# --- starts --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("task", ["lt", "gs", "rt", "mixed"])
+def test_starts_are_forty_metres_before_the_box_in_the_lane_of_the_route(task):
+    env = make(2000, task=task, seed=2)
+    view = reset(env)
+    route, ego = view["route"].squeeze(-1), view["ego"]
+    assert set(route.tolist()) == set(ROUTES_OF_TASK[task])
+    lanes = {"lt": 2.0, "gs_inner": 2.0, "gs_outer": 6.0, "rt": 6.0}
+    lane = torch.tensor([lanes[name] for name in ROUTES])
+    assert torch.equal(ego[:, 1], lane[route])
+    assert torch.allclose(ego[:, 5], torch.tensor(NORTH))
+    assert (ego[:, [4, 6]] == 0).all()
+    for column, low, high in ((2, 50.0, 60.0), (3, 6.0, 10.0)):
+        values = (ego[:, column].sort().values - low) / (high - low)
+        expected = (torch.arange(2000) + 0.5) / 2000
+        assert values[0] >= 0 and values[-1] <= 1
+        assert (values - expected).abs().max() < 0.05
+    if task == "mixed":
+        share = torch.bincount(route, minlength=4) / 2000
+        assert (share - torch.tensor([2, 1, 1, 2]) / 6).abs().max() < 0.04
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_route_starts_spread_their_share_along_the_route(share):
+    seeds = episode_seeds(1, 4000)
+    route = draw_route("mixed", seeds)
+    state = draw_start(route, seeds, share)
+    lines = reference_lines(route, state)[:, 0]
+    pose, s, distance = project(state[:, :2], lines)
+    assert distance.max() < 1e-9 and torch.allclose(pose[:, 2], state[:, 4])
+    start, goal = 55.0, lines[:, 3, 5] + 25.0
+    assert (s >= start - 1e-9).all() and (s <= goal + 1e-9).all()
+    beyond = s > 65.0
+    # Uniform over the route: what lies beyond the usual 10 m of starts.
+    expected = share * (1 - (10.0 / (goal - start)).mean())
+    assert abs(beyond.double().mean() - expected) < 0.03
+    if share:
+        place = ((s - 65.0) / (goal - 65.0))[beyond].sort().values
+        uniform_place = (torch.arange(len(place)) + 0.5) / len(place)
+        assert (place - uniform_place).abs().max() < 0.05
+
+
+# --- partial resets ------------------------------------------------------------------------------
+
+
+def test_a_partial_reset_touches_only_its_rows():
+    env, twin = make(4, task="mixed", seed=6), make(4, task="mixed", seed=6)
+    rows = torch.tensor([False, True, False, True])
+    actions = noise(6, 4, seed=1) * 0.2
+    reset(env), reset(twin)
+    for action in actions[:3]:
+        before = step(env, action)
+        step(twin, action)
+    after = reset_rows(env, before, rows)
+    assert equal(after[~rows], before[~rows])
+    assert (after["ego"][rows] != before["ego"][rows]).any(-1).all()
+    fresh = make(4, task="mixed", seed=6)
+    reset(fresh)
+    second = reset(fresh)
+    assert equal(after[rows], second[rows]), "the next episode of its own sequence"
+    for action in actions[3:]:
+        here, there = step(env, action), step(twin, action)
+        assert equal(here[~rows], there[~rows])
+        assert torch.equal(here["reward"][~rows], there["reward"][~rows])
+    # The others' sequences of episodes have not moved either.
+    assert equal(reset(env)[~rows], second[~rows])
+
+
+def test_a_partial_reset_restarts_the_clock_and_the_last_action_of_its_rows():
+    env = make(2, task="gs", duration=2.0, seed=6)
+    reset(env)
+    for _ in range(4):
+        view = step(env, (0.5, 0.0))
+    reset_rows(env, view, [True, False])
+    ends = [step(env, COAST)["truncated"].squeeze(-1).tolist() for _ in range(10)]
+    assert ends.index([False, True]) == 5  # its tenth decision
+    assert ends[9][0] and not any(end[0] for end in ends[:9])
+
+
+def test_rollout_resets_what_has_ended():
+    env = make(8, task="mixed", seed=6, duration=3.0)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        data = env.rollout(40, break_when_any_done=False)
+    done = data["next", "done"].squeeze(-1)
+    assert done.sum() >= 16
+    follows = torch.isclose(data["ego"][:, 1:], data["next", "ego"][:, :-1]).all(-1)
+    assert torch.equal(follows, ~done[:, :-1])
+    assert (data["ego"][:, 1:][done[:, :-1]][:, 2] >= 50.0).all()
+
+
+# --- ends of episodes ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("frequency", "decisions"), [(5, 125), (10, 250)])
+def test_an_episode_is_truncated_after_25_seconds(frequency, decisions):
+    env = make(3, policy_frequency=frequency)
+    reset(env)
+    for k in range(1, decisions + 1):
+        view = step(env, BRAKE)
+        assert view["truncated"].all() == (k == decisions), k
+        assert torch.equal(view["done"], view["truncated"])
+        assert not view["terminated"].any()
+
+
+@pytest.mark.parametrize("frequency", [5, 10])
+def test_a_decision_lasts_as_long_as_the_clock_says(frequency):
+    """Straight on at constant speed: 9 m/s for a second are 9 m."""
+    env = make(1, task="gs", policy_frequency=frequency)
+    view = reset(env)
+    y, speed = view["ego"][0, 2].item(), view["ego"][0, 3].item()
+    for _ in range(frequency):
+        view = step(env, COAST)
+    assert view["ego"][0, 2].item() == pytest.approx(y - speed, abs=1e-4)
+
+
+@pytest.mark.parametrize("frequency", [5, 10])
+def test_a_car_that_stands_still_is_truncated_in_its_time(frequency):
+    env = make(1, task="gs", standstill=2.0, policy_frequency=frequency)
+    speed = reset(env)["ego"][0, 3].item()
+    still = 0
+    # Brakes to a stop, waits 1.6 s, drives for a moment, brakes again and waits.
+    plan = [BRAKE] * math.ceil(frequency * speed / 5.0) + [BRAKE] * int(1.6 * frequency)
+    plan += [(1.0, 0.0)] * 2 + [BRAKE] * (4 * frequency)
+    for action in plan:
+        view = step(env, action)
+        speed = max(speed + action[0] * 5.0 / frequency, 0.0)
+        assert view["ego"][0, 3].item() == pytest.approx(speed, abs=1e-4)
+        still = still + 1 if speed < 0.3 else 0
+        assert view["truncated"].item() == (still >= 2 * frequency)
+        assert not view["terminated"].item()
+        if view["truncated"].item():
+            break
+    assert still == 2 * frequency
+
+
+def test_leaving_the_road_terminates():
+    env = make(5, task="mixed")
+    reset(env)
+    for _ in range(20):
+        view = step(env, HARD_LEFT)
+        off = view["offroad"]
+        assert torch.equal(view["terminated"], off) and torch.equal(view["done"], off)
+        assert (view["reward"][off] < -40).all() and (view["reward"][~off] > -10).all()
+        assert not view["collision"].any() and not view["success"].any()
+        if off.any():
+            break
+    assert off.any()
+
+
+def test_a_crash_in_the_last_decision_is_terminated():
+    def crash(duration):
+        env = make(1, task="gs", duration=duration)
+        reset(env, [11])
+        for k in range(1, 30):
+            view = step(env, HARD_LEFT)
+            if view["done"]:
+                return k, view
+
+    decisions, free = crash(25.0)
+    assert free["terminated"] and not free["truncated"]
+    last, view = crash(decisions / 5)
+    assert last == decisions
+    assert view["terminated"] and view["offroad"] and view["done"]
+    assert torch.equal(view["reward"], free["reward"])
+    last, view = crash((decisions - 1) / 5)
+    assert last == decisions - 1
+    assert view["truncated"] and not view["terminated"] and not view["offroad"]
+
+
+def test_arriving_terminates_with_success():
+    env = make(6, task="gs", seed=1)
+    reset(env)
+    for _ in range(60):
+        view = step(env, (0.2, 0.0))
+        ego, success = view["ego"], view["success"].squeeze(-1)
+        assert torch.equal(success, ego[:, 2] <= -40.0)
+        assert torch.equal(view["terminated"].squeeze(-1), success)
+        assert (view["reward"].squeeze(-1)[success] > 90).all()
+        if success.any():
+            break
+    assert success.any()
+    assert (view["cost"] == 0).all(), "an empty road costs nothing"
+
+
+def test_actions_beyond_the_box_are_clipped():
+    env = make(2)
+    reset(env, [3, 3])
+    view = step(env, torch.tensor([[1.0, -1.0], [7.0, -3.0]]))
+    assert torch.equal(view["ego"][0], view["ego"][1])
+
+
+# --- state ---------------------------------------------------------------------------------------
+
+
+def test_state_dict_continues_exactly_across_resets():
+    actions = noise(20, 3, seed=2) * 0.5
+    env = make(3, task="mixed", seed=9, route_starts=0.5)
+    reset(env)
+    for action in actions[:7]:
+        view = step(env, action)
+    reset_rows(env, view, [True, False, False])
+    stored = {key: value.clone() for key, value in env.state_dict().items()}
+
+    def onwards(env):
+        out = [step(env, action) for action in actions[7:12]]
+        out.append(reset_rows(env, out[-1], [False, True, True]))
+        out += [step(env, action) for action in actions[12:]]
+        return [*out, reset(env)]
+
+    expected = onwards(env)
+    assert not torch.equal(env.state_dict()["ego"], stored["ego"])
+    other = make(3, task="mixed", seed=77, route_starts=0.5)
+    other.load_state_dict(stored)
+    for here, there in zip(onwards(other), expected, strict=True):
+        assert set(here.keys()) == set(there.keys())
+        assert equal(here, there, there.keys())
+    # What was loaded is not the caller's memory.
+    other.load_state_dict(stored)
+    onwards(other)
+    again = make(3, task="mixed", seed=1, route_starts=0.5)
+    again.load_state_dict(stored)
+    assert equal(onwards(again)[-1], expected[-1])
+
+
+def test_snapshot_is_the_state_of_one_environment():
+    env = make(3, task="mixed")
+    view = reset(env)
+    ego, others = env.snapshot(1)
+    assert ego.shape == (6,) and others.shape == (0, 6)
+    assert torch.allclose(torch.tensor(ego).float(), view["ego"][1, 1:7])
+    assert env.render(0) is None

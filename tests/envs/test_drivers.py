@@ -1,0 +1,132 @@
+"""The scripted drivers on the empty road, and what the cautious one does about others."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from saferl.envs.intersection import BatchedIntersection, Scenario
+from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver
+from saferl.envs.intersection.geometry import ROUTES
+
+NORTH = -math.pi / 2
+
+
+def play(driver, task, frequency=5, num_envs=64, seed=0):
+    """Whether each first episode succeeded, the actions taken and the speeds reached in it."""
+    scenario = Scenario(task=task, vehicles=0, policy_frequency=frequency)
+    env = BatchedIntersection(scenario, num_envs=num_envs, seed=seed)
+    tensordict = env.reset()
+    alive = torch.ones(num_envs, dtype=torch.bool)
+    success = torch.zeros(num_envs, dtype=torch.bool)
+    actions, speeds = [], []
+    for _ in range(scenario.horizon):
+        tensordict = env.step(driver(tensordict))
+        actions.append(tensordict["action"][alive])
+        speeds.append(tensordict["next", "ego"][alive, 3])
+        success |= alive & tensordict["next", "success"].squeeze(-1)
+        alive &= ~tensordict["next", "done"].squeeze(-1)
+        if not alive.any():
+            break
+        tensordict = tensordict["next"].exclude("reward", "cost")
+    return success, torch.cat(actions), torch.cat(speeds)
+
+
+@pytest.mark.parametrize(("task", "frequency"), [("lt", 5), ("gs", 5), ("rt", 5), ("mixed", 10)])
+def test_every_crossing_of_the_empty_road_succeeds(task, frequency):
+    success, actions, speeds = play(Driver(), task, frequency)
+    assert success.all()
+    assert actions.abs().max() <= 1.0
+    assert speeds.max() < 10.1  # the fastest start; it cruises at 9
+    cautious, same, _ = play(CautiousDriver(), task, frequency)
+    assert cautious.all()
+    assert torch.equal(same, actions)
+
+
+def test_the_cruising_speed_is_a_setting():
+    _, _, slow = play(Driver(speed=4.0), "gs", num_envs=8)
+    assert slow[-40:].mean().item() == pytest.approx(4.0, abs=0.1)
+
+
+def view(*vehicles, y=60.0, speed=9.0, rows=11, route="gs_inner"):
+    """The observation of a north-bound ego in the inner lane, and others at (dx, dy, v_x, v_y,
+    heading): world frame, the velocities absolute."""
+    table = torch.zeros(1, rows, 6)
+    for row, (dx, dy, v_x, v_y, heading) in enumerate(vehicles):
+        table[0, row] = torch.tensor([1.0, dx, dy, v_x, v_y + speed, heading])
+    ego = torch.tensor([[1.0, 2.0, y, speed, 0.0, NORTH, 0.0, 70.0, 100.0]])
+    return TensorDict(
+        {"ego": ego, "vehicles": table, "route": torch.tensor([[ROUTES.index(route)]])}, [1]
+    )
+
+
+STANDING = (0.0, -15.0, 0.0, 0.0, NORTH)
+CROSSING = (-22.0, -22.0, 9.0, 0.0, 0.0)  # meets the ego where it is in 22 / 9 s
+
+
+@pytest.mark.parametrize("other", [STANDING, CROSSING])
+def test_cautious_brakes_for_who_is_in_the_way_and_blind_does_not(other):
+    free = CautiousDriver()(view())["action"]
+    assert free[0, 0].abs() < 1e-6  # at 9 m/s already
+    assert CautiousDriver()(view(other))["action"][0, 0] < -0.5
+    assert torch.equal(Driver()(view(other))["action"], free)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        (4.0, -10.0, 0.0, -9.0, NORTH),  # beside, same way, same speed
+        (-4.0, -40.0, 0.0, 9.0, -NORTH),  # oncoming, on its own side
+        (0.0, 25.0, 0.0, -9.0, NORTH),  # behind
+        (-22.0, -22.0, -9.0, 0.0, math.pi),  # driving away
+    ],
+)
+def test_cautious_drives_on_past_who_is_not_in_the_way(other):
+    assert torch.equal(CautiousDriver()(view(other))["action"], CautiousDriver()(view())["action"])
+
+
+def test_cautious_ignores_absent_rows():
+    tensordict = view(STANDING)
+    tensordict["vehicles"][0, 0, 0] = 0.0
+    assert torch.equal(CautiousDriver()(tensordict)["action"], CautiousDriver()(view())["action"])
+    none = view(rows=1)
+    assert torch.equal(CautiousDriver()(none)["action"], CautiousDriver()(view())["action"])
+
+
+def test_cautious_batches_give_what_singles_give():
+    singles = [view(), view(STANDING), view(CROSSING, route="lt"), view(STANDING, CROSSING)]
+    batch = torch.cat(singles)
+    expected = torch.cat([CautiousDriver()(single)["action"] for single in singles])
+    assert torch.allclose(CautiousDriver()(batch)["action"], expected, atol=1e-6)
+    shaped = CautiousDriver()(batch.reshape(2, 2))["action"]
+    assert torch.allclose(shaped.reshape(4, 2), expected, atol=1e-6)
+
+
+def test_random_driver_has_a_generator_of_its_own():
+    first, second, other = RandomDriver(seed=1), RandomDriver(seed=1), RandomDriver(seed=2)
+    state = torch.get_rng_state()
+    drawn = []
+    for _ in range(3):
+        drawn.append(first(view())["action"])
+        assert not torch.equal(drawn[-1], other(view())["action"])
+    assert torch.equal(torch.get_rng_state(), state)
+    # Nor does the global generator, or another driver, move its sequence.
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(99)
+        torch.rand(5)
+        again = [second(view())["action"] for _ in range(3)]
+    assert all(torch.equal(a, b) for a, b in zip(drawn, again, strict=True))
+    assert not torch.equal(drawn[0], drawn[1])
+
+
+def test_random_driver_is_uniform_on_the_box():
+    tensordict = torch.cat([view()] * 4000)
+    action = RandomDriver(seed=3)(tensordict)["action"]
+    assert action.shape == (4000, 2)
+    quantiles = torch.quantile(action, torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0]), dim=0)
+    expected = torch.tensor([-1.0, -0.5, 0.0, 0.5, 1.0])[:, None]
+    assert (quantiles - expected).abs().max() < 0.06
+    assert torch.corrcoef(action.T)[0, 1].abs() < 0.06
