@@ -36,8 +36,10 @@ def launch(command: str, config: str) -> None:
 
         try:
             getattr(commands, command)(cfg)
-        except BaseException:
+        except BaseException as error:
             _drop_if_empty(Path(HydraConfig.get().runtime.output_dir))
+            if isinstance(error, MISTAKES) and before != "1":
+                raise SystemExit(f"error: {explain(error)}") from None
             raise
 
     try:
@@ -95,6 +97,12 @@ def _unknown_key(key: str, config: str, arguments: list[str]) -> str:
         parent, _, name = parent.rpartition(".")
         node = OmegaConf.select(composed, parent) if parent else composed
     choices = [str(k) for k in node if k != "_target_"]
+    if "_target_" in node:
+        from saferl.validation import arguments  # late, as it imports the target
+
+        choices = list(arguments(node._target_) or choices)
+    if name in choices:
+        return f"{key!r} stands at the default of its class; set it with +{key}=..."
     close = difflib.get_close_matches(name, choices, n=1)
     hint = f" (did you mean {close[0]}?)" if close else ""
-    return f"unknown key {key!r}{hint}; choose from {', '.join(choices)}, or add it with +{key}=..."
+    return f"unknown key {key!r}{hint}; choose from {', '.join(choices)}."

@@ -35,6 +35,8 @@ def pretrained_run(name: str, root: Path = PACKAGE / "pretrained") -> Path:
     names = sorted(path.name for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
     if name not in names:
         raise ValueError(
-            f"pretrained must be one of {', '.join(names) or 'none yet'}, got {name!r}."
+            f"pretrained must be one of {', '.join(names)}, got {name!r}."
+            if names
+            else f"pretrained={name}: no policy ships with this version; use checkpoint=RUN."
         )
     return root / name

@@ -40,6 +40,7 @@ TRAINING = {
     "evaluation.num_envs": (int, 1, math.inf),
     "evaluation.policy_frequency": (int, 1, math.inf),
     "collector.frames_per_env": (int, 1, math.inf),
+    "encoder.policy.width": (int, 1, math.inf),
     "critic.members": (int, 1, math.inf),
     "cost_critic.members": (int, 0, math.inf),
     "init": (str | None, 0, 0),
@@ -103,7 +104,7 @@ def check_numbers(cfg: DictConfig, table: dict[str, tuple[Any, float, float]]) -
         allowed = describe(kind)
         if fits(0, kind) and low > -math.inf:
             more = "> 0" if key in POSITIVE else f">= {low:g}"
-            allowed += f" {more}" if high == math.inf else f" {more} and <= {high:g}"
+            allowed += f", {more}" if high == math.inf else f", {more} and <= {high}"
         raise ValueError(f"{key} must be {allowed}, got {value!r}.")
 
 
@@ -146,7 +147,7 @@ def check_targets(node: Any, path: str = "") -> None:
     if not isinstance(node, DictConfig):
         return
     target = node.get("_target_")
-    accepted = None if target is None else _signature(target, path)
+    accepted = None if target is None else arguments(target)
     for key, value in node.items():
         name = f"{path}.{key}".removeprefix(".")
         if accepted is not None and not str(key).startswith("_"):
@@ -159,20 +160,26 @@ def check_targets(node: Any, path: str = "") -> None:
         check_targets(value, name)
 
 
-def _signature(target: str, path: str) -> dict[str, Any] | None:
-    """Arguments and their annotations; None where it takes any."""
+def arguments(target: str) -> dict[str, Any] | None:
+    """Arguments that a ``_target_`` takes with their annotations; None where it takes any.
+
+    Raises:
+        ValueError: there is no such class or function.
+    """
     try:
         function = hydra.utils.get_object(target)
     except Exception as error:
-        raise ValueError(f"{path}._target_ names no class: {target!r}.") from error
+        raise ValueError(f"_target_ names nothing that can be imported: {target!r}.") from error
+    # A metaclass, as TorchRL's environments have, hides what __init__ takes.
+    function = function.__init__ if inspect.isclass(function) else function
     try:
         signature = inspect.signature(function, eval_str=True)
     except NameError:  # annotations that exist for type checkers alone
         signature = inspect.signature(function)
-    kinds = {parameter.kind for parameter in signature.parameters.values()}
-    if inspect.Parameter.VAR_KEYWORD in kinds:
+    parameters = signature.parameters
+    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values()):
         return None
-    return {name: parameter.annotation for name, parameter in signature.parameters.items()}
+    return {name: p.annotation for name, p in parameters.items() if name != "self"}
 
 
 def fits(value: Any, kind: Any) -> bool:

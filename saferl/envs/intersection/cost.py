@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from saferl.envs.intersection.dynamics import step_ego, step_vehicle
+from saferl.envs.intersection.dynamics import predict_vehicles, step_ego
 from saferl.envs.intersection.geometry import overlap
 
 
@@ -63,13 +63,13 @@ class CollisionCost:
         """
         speed = torch.hypot(ego[..., 2], ego[..., 3])
         beta = torch.linspace(*self.growth, self.steps, dtype=ego.dtype, device=ego.device)
-        hits = []
-        for scale in beta:
-            ego, vehicles = step_ego(ego, control, self.dt), step_vehicle(vehicles, self.dt)
-            ego_pose = torch.stack([ego[..., 0], ego[..., 1], ego[..., 4]], -1)[..., None, :]
-            pose = torch.stack([vehicles[..., 0], vehicles[..., 1], vehicles[..., 4]], -1)
-            hits.append((overlap(ego_pose, pose, scale=scale) & observed).sum(-1))
-        count = torch.stack(hits, -1).to(ego.dtype)
+        own = []
+        for _ in range(self.steps):
+            ego = step_ego(ego, control, self.dt)
+            own.append(torch.stack([ego[..., 0], ego[..., 1], ego[..., 4]], -1))
+        poses = predict_vehicles(vehicles, self.dt, self.steps)  # [..., N, T, 3]
+        hits = overlap(torch.stack(own, -2)[..., None, :, :], poses, scale=beta)
+        count = (hits & observed[..., None]).sum(-2).to(ego.dtype)  # [..., T]
         total = (
             self.initial * speed / self.base_speed * (count * torch.exp(-self.decay * beta)).sum(-1)
         )

@@ -78,3 +78,28 @@ def step_vehicle(state: Tensor, dt: float) -> Tensor:
         ],
         -1,
     )
+
+
+def predict_vehicles(state: Tensor, dt: float, steps: int) -> Tensor:
+    """Poses [..., steps, 3] (x, y, heading) that ``steps`` calls of :func:`step_vehicle` give.
+
+    The sums over time are taken at once, without a loop.
+
+    Args:
+        state: [..., 6].
+        dt: seconds.
+        steps: how many.
+    """
+    x, y, v_x, v_y, phi, omega = state[..., None, :].unbind(-1)
+    index = torch.arange(steps, dtype=state.dtype, device=state.device)
+    heading = phi + dt * index * omega
+    cos, sin = torch.cos(heading), torch.sin(heading)
+    slip = torch.where(index == 0, v_y, 0.0)
+    return torch.stack(
+        [
+            x + dt * (v_x * cos - slip * sin).cumsum(-1),
+            y + dt * (v_x * sin + slip * cos).cumsum(-1),
+            heading + dt * omega,
+        ],
+        -1,
+    )

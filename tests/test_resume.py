@@ -1,0 +1,149 @@
+"""A run that was killed and continued is the run that was not."""
+
+from __future__ import annotations
+
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from conftest import EMPTY, SMALL, compose, spawn
+from tensordict import TensorDict
+
+from saferl.builders import build_trainer
+from saferl.trainer import Trainer
+
+TRAFFIC = ("task.vehicles=3", "task=gs", "collector.frames_per_env=4")
+
+
+def everything(trainer: Trainer) -> dict:
+    """All state of a run but for its wall-clock, as nested dicts."""
+    parts = trainer.checkpoint.checkpoint.components
+    return {name: part.state_dict() for name, part in parts.items() if name not in ("clock", "files")}
+
+
+def assert_same(ours, theirs, at: str = "") -> None:
+    if hasattr(ours, "items"):
+        assert list(ours) == list(theirs), at
+        for key in ours:
+            assert_same(ours[key], theirs[key], f"{at}.{key}")
+    elif isinstance(ours, (list, tuple)):
+        assert len(ours) == len(theirs), at
+        for index, (one, other) in enumerate(zip(ours, theirs, strict=True)):
+            assert_same(one, other, f"{at}[{index}]")
+    elif hasattr(ours, "shape"):
+        assert ours.dtype == theirs.dtype and ours.shape == theirs.shape, at
+        # NaN is equal to itself here, bit for bit is what is meant.
+        assert ((ours == theirs) | ((ours != ours) & (theirs != theirs))).all(), at
+    else:
+        assert ours == theirs, at
+
+
+def restored(run: Path, *overrides: str) -> Trainer:
+    trainer = build_trainer(compose(*overrides), run)
+    trainer.resume()
+    return trainer
+
+
+@pytest.mark.parametrize("algo", ["sac", "arsac"])
+def test_killed_and_resumed_equals_uninterrupted(algo: str, tmp_path: Path):
+    """SIGKILL in mid-episode on highway-env with traffic, a projector at work in ``arsac``."""
+    options = (*SMALL, *TRAFFIC, f"algo={algo}", "frames=80", "save_every=8", "warmup_frames=16")
+    whole = spawn("saferl", *options, "out=whole", cwd=tmp_path)
+    killed = spawn("saferl", *options, "out=killed", cwd=tmp_path)
+    # Half of the run or so: where exactly it dies must not matter.
+    deadline = time.monotonic() + 300
+    while not list((tmp_path / "killed/checkpoints").glob("checkpoint-*0[3-5]?")):
+        assert killed.poll() is None and time.monotonic() < deadline, killed.stderr.read()
+        time.sleep(0.02)
+    killed.send_signal(signal.SIGKILL)
+    assert killed.wait() == -signal.SIGKILL
+    killed.communicate()
+
+    resumed = spawn("saferl", "resume=killed", cwd=tmp_path)
+    out, err = resumed.communicate(timeout=300)
+    assert resumed.returncode == 0, err
+    assert "Resumed" in out
+    assert whole.wait(timeout=300) == 0, whole.stderr.read()
+    whole.communicate()
+
+    one, other = (restored(tmp_path / name, *options) for name in ("whole", "killed"))
+    assert one.progress.frames == 80 and one.progress.updates == 34
+    assert_same(everything(one), everything(other))
+    rows = one.buffer[:]
+    assert (rows["index"].flatten().diff() != 0).all()  # a true buffer was compared
+    if algo == "arsac":
+        assert (rows["action"] != rows["action_proposed"]).any()
+    for name in ("metrics.csv", "evaluation/episodes.csv", "evaluation/metrics.json"):
+        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "killed" / name).read_bytes()
+
+
+@pytest.mark.parametrize("algo", ["sac_lag", "rsac"])
+def test_every_later_step_is_the_same(algo: str, tmp_path: Path):
+    """In one process: the state after a resume equals the state that was saved, and so does each
+    update, action and environment step from there, with a multiplier, a late projector, a PID's
+    memory, a buffer that has wrapped round, and loss sums of half a row."""
+    options = [*SMALL, *EMPTY, f"algo={algo}", "frames=120", "record_every=31", "save_every=1000"]
+    options += ["buffer_size=40", "task.duration=3"]
+    options += ["projector.start=0.4", "lagrange=pid"] if algo == "rsac" else []
+    trainer = build_trainer(compose(*options), tmp_path / "a")
+    batches = iter(trainer.collector)
+    for _ in range(35):
+        trainer._take(next(batches))
+        if trainer.progress.frames - trainer.progress.last_record >= trainer.record_every:
+            trainer._record()
+    trainer.save()
+    assert trainer._count and trainer.progress.episodes
+
+    build_trainer(compose(*options), tmp_path / "a").save  # another in between disturbs nothing
+    copy = restored(tmp_path / "a", *options)
+    assert_same(everything(trainer), everything(copy))
+    rng = trainer.checkpoint.checkpoint.components["rng"]
+    state = rng.state_dict()
+    trainer.train()
+    rng.load_state_dict(state)
+    copy.train()
+    assert_same(everything(trainer), everything(copy))
+
+
+def test_progress_is_shown_from_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    options = [*SMALL, *EMPTY, "algo=sac"]
+    trainer = build_trainer(compose(*options), tmp_path)
+    batches = iter(trainer.collector)
+    for _ in range(5):
+        trainer._take(next(batches))
+    trainer.save()
+
+    shown = []
+
+    def bar(*args, **kwargs):
+        shown.append(kwargs)
+        return real(*args, **kwargs)
+
+    import saferl.trainer
+
+    real = saferl.trainer.tqdm
+    monkeypatch.setattr(saferl.trainer, "tqdm", bar)
+    restored(tmp_path, *options).train()
+    assert shown[0]["initial"] == 10 and shown[0]["total"] == 24
+
+
+def test_resuming_a_finished_run_changes_nothing(tmp_path: Path, command, caplog):
+    command("train", "config", *SMALL, *EMPTY, "algo=sac", "out=run")
+    kept = ("metrics.csv", "config.yaml", "evaluation/metrics.json", "evaluation/episodes.csv")
+    before = {name: (tmp_path / "run" / name).read_bytes() for name in kept}
+    checkpoints = sorted((tmp_path / "run/checkpoints").iterdir())
+    command("train", "config", "resume=run")
+    assert {name: (tmp_path / "run" / name).read_bytes() for name in kept} == before
+    assert sorted((tmp_path / "run/checkpoints").iterdir()) == checkpoints
+
+
+def test_a_run_killed_before_its_first_episode_can_be_resumed(tmp_path: Path):
+    """A checkpoint is there from the first frame on."""
+    options = [*SMALL, *EMPTY, "algo=sac"]
+    trainer = build_trainer(compose(*options), tmp_path)
+    trainer.save()
+    copy = restored(tmp_path, *options)
+    assert copy.progress.frames == 0 and len(copy.buffer) == 0
+    copy.train()
+    assert copy.progress.frames == 24 and isinstance(copy.buffer[:], TensorDict)
