@@ -66,14 +66,25 @@ def refusal(command):
     return run
 
 
-def spawn(module: str, *arguments: str, cwd: Path, **options) -> subprocess.Popen:
-    """Start a command in a process of its own."""
-    return subprocess.Popen(
-        [sys.executable, "-m", module, *arguments],
-        cwd=cwd,
-        env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        **options,
-    )
+@pytest.fixture
+def spawn(tmp_path: Path):
+    """Starts a module in a process of its own, which does not outlive the test."""
+    processes: list[subprocess.Popen] = []
+
+    def start(module: str, *arguments: str) -> subprocess.Popen:
+        processes.append(
+            subprocess.Popen(
+                [sys.executable, "-m", module, *arguments],
+                cwd=tmp_path,
+                env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"},
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+        )
+        return processes[-1]
+
+    yield start
+    for process in processes:
+        process.kill()
+        process.communicate()

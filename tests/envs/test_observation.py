@@ -94,8 +94,6 @@ def test_observe_equals_a_loop_over_vehicles(rows, count):
             torch.tensor(ego), torch.tensor(vehicles), torch.tensor(present),
             torch.tensor(route), rows,
         )  # fmt: skip
-        if own[7] > 70:  # see test_vehicle_distance_of_a_far_car_abeam
-            own[7] = ours[0][7]
         np.testing.assert_allclose(ours[0].numpy(), own, atol=1e-9)
         np.testing.assert_allclose(ours[1].numpy(), table, atol=1e-9)
         assert ours[2].nonzero().flatten().tolist() == sorted(nearest)
@@ -247,7 +245,6 @@ def test_vehicle_distance_ignores_the_unobserved_and_goes_below_zero():
     assert none == 70.0
 
 
-@pytest.mark.xfail(strict=True, reason="d_veh is capped at 70 m even where a vehicle is observed")
 def test_vehicle_distance_of_a_far_car_abeam():
     """A car inside the window but further than 70 m to the side."""
     own, table, observed = scene(car(0, 0, 5, NORTH), car(90.0, 0.0))

@@ -29,10 +29,11 @@ def vehicle_distance(ego: Tensor, vehicles: Tensor, observed: Tensor) -> Tensor:
         vehicles: [..., N, 6].
         observed: bool [..., N]; with none observed the distance is 70 m.
     """
-    far = torch.full_like(ego[..., :1], AHEAD)
     offset = _circles(vehicles)[..., None, :] - _circles(ego)[..., None, None, :, :]
     gap = offset.norm(dim=-1).flatten(-2).amin(-1) - 2 * _RADIUS
-    return torch.cat([torch.where(observed, gap, AHEAD), far], -1).amin(-1)
+    none = torch.full_like(ego[..., :1], torch.inf)  # also where there is no vehicle at all
+    nearest = torch.cat([torch.where(observed, gap, torch.inf), none], -1).amin(-1)
+    return torch.where(observed.any(-1), nearest, AHEAD)
 
 
 def destination_distance(ego: Tensor, route: Tensor) -> Tensor:
