@@ -21,8 +21,9 @@ from saferl.checkpoint import latest, load_component
 from saferl.envs.intersection import Scenario
 from saferl.envs.transforms import ExecutedAction, SafetyProjector
 from saferl.hooks import ProjectorProgress
+from saferl.learner import Learner
 from saferl.modules import tanh_gaussian_actor, value_operator
-from saferl.trainer import Budget, Learner, Trainer
+from saferl.trainer import Budget, Trainer
 from saferl.validation import check_training
 
 #: What the replay buffer keeps of a transition.
@@ -174,13 +175,13 @@ def build_loggers(cfg: DictConfig, run: Path) -> list:
     """TorchRL loggers that write into the run's folder.
 
     Raises:
-        ImportError: a logger's own package is not installed.
+        ValueError: a logger's own package is not installed.
     """
     try:
         return [make(sink, log_dir=str(run)) for sink in cfg.logger.sinks]
     except ImportError as error:
         names = ", ".join(sink._target_ for sink in cfg.logger.sinks)
-        raise ImportError(
+        raise ValueError(
             f"logger: {names} needs a package that is not installed ({error}); "
             "install it (pip install 'saferl[wandb]' for W&B), or use logger=tensorboard or none."
         ) from error

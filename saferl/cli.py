@@ -17,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from saferl.paths import config_dir
 
 #: What a user can get wrong; any other exception is a fault of ours and keeps its trace.
-MISTAKES = (ValueError, OSError, ImportError, HydraException, OmegaConfBaseException)
+MISTAKES = (ValueError, OSError, HydraException, OmegaConfBaseException)
 INTERRUPTED = 130
 
 

@@ -6,7 +6,6 @@ import logging
 import signal
 import threading
 import time
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -18,10 +17,10 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.data import ReplayBuffer
-from torchrl.objectives import LossModule, SoftUpdate
 from tqdm import tqdm
 
 from saferl.checkpoint import BufferState, CollectorState, Fitting, GrowingFiles, RunCheckpoint
+from saferl.learner import Learner
 from saferl.metrics import CsvLog, EpisodeWindow
 
 log = logging.getLogger(__name__)
@@ -53,52 +52,6 @@ class Budget:
         """Fraction of the budget that is spent, in [0, 1]."""
         done, whole = (episodes, self.episodes) if self.episodes else (frames, self.frames)
         return min(1.0, done / whole)
-
-
-class Learner:
-    """One gradient step on every term of a loss, and the target networks' soft update.
-
-    Args:
-        loss: any TorchRL LossModule.
-        optimizer: over the loss's parameters; each group holds ``schedule``, its (first, last)
-            learning rate, linear in the fraction of the budget that is spent.
-        target_updater: soft update of the loss's targets.
-        after_update: called with the loss's output after each step (a multiplier, for example).
-        compile: compile the loss.
-    """
-
-    def __init__(
-        self,
-        loss: LossModule,
-        optimizer: torch.optim.Optimizer,
-        target_updater: SoftUpdate,
-        after_update: list[Callable[[TensorDictBase], None]] | None = None,
-        compile: bool = False,
-    ):
-        self.loss, self.optimizer, self.target_updater = loss, optimizer, target_updater
-        self.after_update = after_update or []
-        self._forward = torch.compile(loss) if compile else loss
-        if compile:
-            log.info("Compiling the loss at its first update: this takes about a minute.")
-            warnings.filterwarnings("ignore", category=UserWarning, module="tensordict|torch._dynamo")
-
-    def schedule(self, spent: float) -> None:
-        """Set the learning rates for a fraction of the budget."""
-        for group in self.optimizer.param_groups:
-            first, last = group["schedule"]
-            group["lr"] = first + (last - first) * spent
-
-    def update(self, batch: TensorDictBase) -> TensorDict:
-        """Returns the loss terms and metrics, detached scalars."""
-        losses = self._forward(batch)
-        total = sum(value for key, value in losses.items() if key.startswith("loss_"))
-        total.backward()
-        self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
-        self.target_updater.step()
-        for hook in self.after_update:
-            hook(losses)
-        return losses.detach()
 
 
 @dataclass

@@ -84,6 +84,7 @@ def test_every_later_step_is_the_same(algo: str, tmp_path: Path):
     options += ["buffer_size=40", "task.duration=3"]
     options += ["projector.start=0.4", "lagrange=pid"] if algo == "rsac" else []
     trainer = build_trainer(compose(*options), tmp_path / "a")
+    trainer.save()
     batches = iter(trainer.collector)
     for _ in range(35):
         trainer._take(next(batches))

@@ -1,0 +1,59 @@
+"""One update of everything that learns."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.objectives import LossModule, SoftUpdate
+
+log = logging.getLogger(__name__)
+
+
+class Learner:
+    """One gradient step on every term of a loss, and the target networks' soft update.
+
+    Args:
+        loss: any TorchRL LossModule.
+        optimizer: over the loss's parameters; each group holds ``schedule``, its (first, last)
+            learning rate, linear in the fraction of the budget that is spent.
+        target_updater: soft update of the loss's targets.
+        after_update: called with the loss's output after each step (a multiplier, for example).
+        compile: compile the loss.
+    """
+
+    def __init__(
+        self,
+        loss: LossModule,
+        optimizer: torch.optim.Optimizer,
+        target_updater: SoftUpdate,
+        after_update: list[Callable[[TensorDictBase], None]] | None = None,
+        compile: bool = False,
+    ):
+        self.loss, self.optimizer, self.target_updater = loss, optimizer, target_updater
+        self.after_update = after_update or []
+        self._forward = torch.compile(loss) if compile else loss
+        if compile:
+            log.info("Compiling the loss at its first update: this takes about a minute.")
+            warnings.filterwarnings("ignore", category=UserWarning, module="tensordict|torch._dynamo")
+
+    def schedule(self, spent: float) -> None:
+        """Set the learning rates for a fraction of the budget."""
+        for group in self.optimizer.param_groups:
+            first, last = group["schedule"]
+            group["lr"] = first + (last - first) * spent
+
+    def update(self, batch: TensorDictBase) -> TensorDict:
+        """Returns the loss terms and metrics, detached scalars."""
+        losses = self._forward(batch)
+        total = sum(value for key, value in losses.items() if key.startswith("loss_"))
+        total.backward()
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        self.target_updater.step()
+        for hook in self.after_update:
+            hook(losses)
+        return losses.detach()
