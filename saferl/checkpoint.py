@@ -161,7 +161,7 @@ class Fitting:
         mine = self.module.state_dict()
         differences = [
             f"{key} is {_shape(state.get(key))} in the checkpoint and {_shape(mine.get(key))} here"
-            for key in sorted({*mine, *state})
+            for key in sorted({*mine, *state}, key=lambda key: (key.startswith("_"), key))
             if _shape(state.get(key)) != _shape(mine.get(key))
         ]
         if differences:

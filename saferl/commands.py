@@ -158,7 +158,7 @@ def choose_policy(cfg: DictConfig) -> tuple[TensorDictModuleBase, list[Transform
             f"got {cfg.task.rows}."
         )
     policy, transforms = trained_policy(trained, path)
-    return policy, transforms if cfg.projector else [], f"{trained.algo_name} ({name})"
+    return policy, transforms if cfg.project else [], f"{trained.algo_name} ({name})"
 
 
 def test(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
@@ -38,6 +39,22 @@ def as_test(scenario: Scenario, policy_frequency: int = 10) -> Scenario:
     )
 
 
+def start(env: EnvBase, seeds: Tensor) -> TensorDictBase:
+    """Reset an intersection, with or without transforms, to the episodes of these seeds.
+
+    TorchRL's ``TransformedEnv.reset`` keeps every key but the environment's state from it, so a
+    ``seed`` must reach the environment itself.
+
+    Args:
+        env: batch size [B].
+        seeds: int64 [B].
+    """
+    request = TensorDict({"seed": seeds}, batch_size=env.batch_size)
+    if not isinstance(env, TransformedEnv):
+        return env.reset(request)
+    return env.transform._reset(request.empty(), env.base_env.reset(request))
+
+
 @torch.no_grad()
 def play(
     policy: TensorDictModuleBase,
@@ -59,7 +76,7 @@ def play(
     """
     steps = []
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        tensordict = env.reset(TensorDict({"seed": seeds}, batch_size=env.batch_size))
+        tensordict = start(env, seeds)
         alive = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
         while alive.any():
             tensordict = env.step(policy(tensordict))
@@ -79,51 +96,51 @@ def episode_rows(steps: list[TensorDictBase], seeds: Tensor) -> list[dict]:
     episode, ``intervention_rate`` is the share of decisions that a projector changed, and
     ``correction`` the mean size of such a change.
     """
-    alive = torch.stack([step["alive"] for step in steps])
-    length = alive.sum(0)
-    last = (length - 1)[None]
+    def over_time(key: str, dtype: torch.dtype = torch.float64) -> Tensor:
+        return torch.stack([step["next", key].to(dtype).squeeze(-1) for step in steps]).cpu()
 
-    def over_time(key: str) -> Tensor:
-        return torch.stack([step["next", key].float().squeeze(-1) for step in steps])
-
-    def total(values: Tensor) -> Tensor:
-        return torch.where(alive, values, 0.0).sum(0)
-
-    def at_end(key: str) -> Tensor:
-        return over_time(key).gather(0, last).squeeze(0)
-
-    moved = shift = torch.zeros(alive.shape, device=alive.device)
+    alive = torch.stack([step["alive"] for step in steps]).cpu()
+    ego = over_time("ego")
+    moved = shift = torch.zeros_like(ego[..., 0])
     if "action_executed" in steps[0]["next"].keys():
         moved = over_time("intervened")
         shift = torch.stack(
             [(step["next", "action_executed"] - step["action"]).norm(dim=-1) for step in steps]
-        )
-    ego = torch.stack([step["next", "ego"] for step in steps])
-    collision, offroad, success = at_end("collision"), at_end("offroad"), at_end("success")
-    columns = {
-        "collision": ((collision + offroad) > 0).float(),
-        "success": success,
-        "frozen": ((collision + offroad + success) == 0).float(),
-        "hit_vehicle": collision,
-        "left_road": offroad,
-        "return": total(over_time("reward")),
-        "speed": total(torch.hypot(ego[..., 3], ego[..., 4])) / length,
-        "cost_return": total(over_time("cost")),
-        "intervention_rate": total(moved) / length,
-        "correction": total(shift) / total(moved).clamp_min(1.0),
-        "min_distance": torch.where(alive, ego[..., 7], torch.inf).amin(0),
-        "decisions": length,
+        ).cpu()
+    values = {
+        "return": over_time("reward"),
+        "speed": torch.hypot(ego[..., 3], ego[..., 4]),
+        "cost_return": over_time("cost"),
+        "intervention_rate": moved,
+        "correction": shift,
     }
-    columns = {key: value.tolist() for key, value in columns.items()}
-    routes = steps[0]["route"].squeeze(-1).tolist()
-    return [
-        {
-            "seed": seed,
-            "route": ROUTES[route],
-            **{key: column[i] for key, column in columns.items()},
-        }
-        for i, (seed, route) in enumerate(zip(seeds.tolist(), routes, strict=True))
-    ]
+    ends = {key: over_time(key, torch.bool) for key in ("collision", "offroad", "success")}
+    rows = []
+    for index, (seed, route, count) in enumerate(
+        zip(seeds.tolist(), steps[0]["route"].flatten().tolist(), alive.sum(0).tolist(), strict=True)
+    ):
+        # Exact sums: they do not depend on how long the episodes beside this one lasted.
+        total = {key: math.fsum(value[:count, index].tolist()) for key, value in values.items()}
+        hit, left, success = (bool(end[count - 1, index]) for end in ends.values())
+        rows.append(
+            {
+                "seed": seed,
+                "route": ROUTES[route],
+                "collision": int(hit or left),
+                "success": int(success),
+                "frozen": int(not (hit or left or success)),
+                "hit_vehicle": int(hit),
+                "left_road": int(left),
+                "return": total["return"],
+                "speed": total["speed"] / count,
+                "cost_return": total["cost_return"],
+                "intervention_rate": total["intervention_rate"] / count,
+                "correction": total["correction"] / max(total["intervention_rate"], 1.0),
+                "min_distance": ego[:count, index, 7].min().item(),
+                "decisions": count,
+            }
+        )
+    return rows
 
 
 def evaluate(

@@ -14,7 +14,6 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Polygon, Rectangle
 from PIL import Image
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -30,6 +29,7 @@ from saferl.envs.intersection.geometry import (
     line_pose,
     reference_lines,
 )
+from saferl.evaluation import start
 
 # Okabe and Ito's palette, which all kinds of colour vision can tell apart.
 EGO, OTHER, CORRECTED, REFERENCE = "#d55e00", "#0072b2", "#000000", "#666666"
@@ -83,7 +83,7 @@ def record(policy: TensorDictModuleBase, env: EnvBase, seed: int) -> Episode:
     if env.batch_size != torch.Size([1]):
         raise ValueError(f"record needs num_envs=1, got batch size {tuple(env.batch_size)}.")
     base = env.base_env if isinstance(env, TransformedEnv) else env
-    tensordict = env.reset(TensorDict({"seed": torch.tensor([seed])}, batch_size=[1]))
+    tensordict = start(env, torch.tensor([seed], device=env.device))
     episode = Episode(seed, ROUTES[int(tensordict["route"])], 1.0 / base.scenario.policy_frequency)
 
     def look() -> None:
@@ -218,7 +218,7 @@ def _reference(axes: Axes, episode: Episode) -> None:
         )
 
 
-def draw_trajectories(axes: Axes, episode: Episode, every: float = 0.5) -> None:
+def draw_trajectories(axes: Axes, episode: Episode, every: float = 1.0) -> None:
     """Rectangles of the ego and of the others every ``every`` seconds, later ones darker, over the
     ego's two reference lines."""
     draw_road(axes)

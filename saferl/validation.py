@@ -51,7 +51,7 @@ TESTING = {
     "seed": (int, 0, 2**31 - 1),
     "threads": (int, 1, math.inf),
     "gif": (int, 0, math.inf),
-    "projector": (bool, 0, 1),
+    "project": (bool, 0, 1),
     "checkpoint": (str | None, 0, 0),
     "pretrained": (str | None, 0, 0),
     "policy": (str | None, 0, 0),

@@ -1,0 +1,164 @@
+"""Tests of policies: the same episodes whatever plays beside them, and the figures of each."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import EMPTY, SMALL
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.envs import TransformedEnv
+
+from saferl.envs.intersection import (
+    BatchedIntersection,
+    HighwayIntersection,
+    IntersectionEnv,
+    Reward,
+    Scenario,
+)
+from saferl.envs.intersection.base import episode_seeds
+from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver
+from saferl.envs.transforms import SafetyProjector
+from saferl.evaluation import as_test, evaluate, write
+from saferl.metrics import FIGURES
+
+ROAD = Scenario(task="mixed", vehicles=0, policy_frequency=10)
+TRAFFIC = Scenario(task="gs", vehicles=4, policy_frequency=5, duration=12.0)
+
+
+def same(ours: list[dict], theirs: list[dict]) -> bool:
+    """Equal rows; sums to float32 rounding, which may differ in the last lanes of a vector unit."""
+    exact = ("episode", "seed", "route", "collision", "success", "decisions")
+    sums = ("return", "speed", "cost_return", "intervention_rate", "correction", "min_distance")
+    return len(ours) == len(theirs) and all(
+        [one[key] for key in exact] == [other[key] for key in exact]
+        and [one[key] for key in sums] == pytest.approx([other[key] for key in sums], rel=1e-5)
+        for one, other in zip(ours, theirs, strict=True)
+    )
+
+
+def wary() -> SafetyProjector:
+    """Corrects whatever accelerates, to a point that does not depend on rounding."""
+    risk = TensorDictModule(lambda action: action[..., :1], ["action"], ["risk"])
+    return SafetyProjector(risk, limit=0.5, steps=5, penalty=1e6)
+
+
+@pytest.mark.parametrize("projected", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "scenario", "driver"),
+    [(BatchedIntersection, ROAD, Driver), (HighwayIntersection, TRAFFIC, CautiousDriver)],
+)
+def test_an_episode_is_a_function_of_its_seed_alone(kind, scenario, driver, projected):
+    """Of neither the number nor the seed of the environments, with transforms as without."""
+
+    def rows(num_envs: int, env_seed: int, seed: int, count: int) -> list[dict]:
+        env = kind(scenario, num_envs=num_envs, seed=env_seed)
+        env = TransformedEnv(env, wary()) if projected else env
+        return evaluate(driver(), env, count, seed=seed, progress=False)
+
+    alone, beside = rows(1, 5, seed=3, count=4), rows(3, 9, seed=3, count=4)
+    assert same(alone, beside)
+    assert same(beside[:2], rows(2, 5, seed=3, count=2))
+    assert [row["episode"] for row in alone] == [0, 1, 2, 3]
+    assert len({row["return"] for row in alone}) == 4
+    assert rows(2, 5, seed=4, count=1)[0]["seed"] != alone[0]["seed"]
+    assert (sum(row["intervention_rate"] for row in alone) > 0) == projected
+
+
+def test_figures_against_gymnasium_by_hand():
+    """The same episode through the gymnasium environment, summed in a plain loop."""
+    row = evaluate(Driver(), HighwayIntersection(TRAFFIC, num_envs=2), 1, seed=7, progress=False)[0]
+    env = IntersectionEnv(task="gs", vehicles=4, policy_frequency=5, duration=12.0)
+    observation, info = env.reset(seed=row["seed"])
+    rewards, costs, speeds, distances, done = [], [], [], [], False
+    route = torch.tensor([[["lt", "gs_inner", "gs_outer", "rt"].index(info["route"])]])
+    while not done:
+        inputs = {key: torch.from_numpy(value)[None] for key, value in observation.items()}
+        action = Driver()(TensorDict({**inputs, "route": route}, [1]))["action"][0]
+        observation, reward, terminated, truncated, info = env.step(action.numpy())
+        rewards.append(reward)
+        costs.append(info["cost"])
+        speeds.append(float((observation["ego"][3:5] ** 2).sum() ** 0.5))
+        distances.append(float(observation["ego"][7]))
+        done = terminated or truncated
+    assert row["decisions"] == len(rewards)
+    assert row["return"] == pytest.approx(sum(rewards), rel=1e-5)
+    assert row["cost_return"] == pytest.approx(sum(costs), rel=1e-5, abs=1e-7)
+    assert row["speed"] == pytest.approx(sum(speeds) / len(speeds), rel=1e-5)
+    assert row["min_distance"] == pytest.approx(min(distances), rel=1e-5)
+    assert row["route"] == info["route"]
+    for key, flag in (("hit_vehicle", "collision"), ("left_road", "offroad"), ("success", "success")):
+        assert row[key] == info[flag]
+    assert row["collision"] == (info["collision"] or info["offroad"])
+    assert row["collision"] + row["success"] + row["frozen"] == 1
+
+
+def test_conditions_of_a_test():
+    """10 Hz, starts before the box, parked cars left alone, reward without r_safe."""
+    training = Scenario(route_starts=0.5, standstill=4.0, reward=Reward(risk_shaping=True))
+    scenario = as_test(training)
+    assert scenario == Scenario(policy_frequency=10)
+    rows = evaluate(
+        TensorDictModule(lambda ego: ego[..., :2] * 0 + torch.tensor([-1.0, 0.0]), ["ego"], ["action"]),
+        BatchedIntersection(as_test(Scenario(vehicles=0, duration=8.0)), num_envs=6),
+        6, seed=0, progress=False,
+    )  # fmt: skip
+    # Braking at once: all stay on the approach, stand there, and play on to the limit.
+    assert all(row["frozen"] == 1 and row["decisions"] == 80 for row in rows)
+
+
+def test_interventions_are_shares_of_decisions():
+    """A risk above the limit for ever: every decision is corrected, by the whole reach."""
+    risk = TensorDictModule(lambda action: 10 + action[..., :1], ["action"], ["risk"])
+    projector = SafetyProjector(risk, limit=0.0, steps=5, step_size=0.02, penalty=1e6)
+    env = TransformedEnv(BatchedIntersection(ROAD, num_envs=2), projector)
+    rows = evaluate(Driver(), env, 2, seed=0, progress=False)
+    assert all(row["intervention_rate"] == pytest.approx(1.0, abs=0.1) for row in rows)
+    plain = evaluate(Driver(), BatchedIntersection(ROAD, num_envs=2), 2, seed=0, progress=False)
+    assert all(row["intervention_rate"] == row["correction"] == 0.0 for row in plain)
+
+
+def test_nothing_after_the_end_counts():
+    """In a batch the others play on; a wreck may meanwhile be anywhere, at any speed."""
+    rows = evaluate(
+        RandomDriver(seed=1), BatchedIntersection(ROAD, num_envs=8), 8, seed=0, progress=False
+    )
+    assert len({row["decisions"] for row in rows}) > 1
+    assert all(0 < row["speed"] < 20 and abs(row["return"]) < 1000 for row in rows)
+
+
+def test_write(tmp_path: Path):
+    rows = evaluate(Driver(), BatchedIntersection(ROAD, num_envs=3), 3, seed=0, progress=False)
+    figures = write(rows, tmp_path / "new", policy="blind", seed=0)
+    stored = json.loads((tmp_path / "new/metrics.json").read_text())
+    assert {key: stored[key] for key in FIGURES} == figures and stored["policy"] == "blind"
+    assert all(0 <= stored[key]["mean"] <= 1 for key in FIGURES if key.endswith("_rate"))
+    lines = (tmp_path / "new/episodes.csv").read_text().splitlines()
+    assert len(lines) == 4 and lines[0].startswith("episode,seed,route,collision")
+    with pytest.raises(ValueError, match="episodes must be >= 1"):
+        evaluate(Driver(), BatchedIntersection(ROAD, num_envs=1), 0, seed=0)
+
+
+def test_a_runs_closing_test_is_the_evaluation_of_its_checkpoint(tmp_path: Path, command):
+    """Training and testing agree (a peer's did not, PEERS 11): same policy, episodes and figures."""
+    arguments = (*EMPTY, "task=rt", "task.duration=2")
+    algo = ("algo=rsac", "projector.steps=5")
+    command("train", "config", *SMALL, *arguments, *algo, "evaluation.episodes=3", "out=run")
+    command("evaluate", "evaluate", *arguments, "checkpoint=run", "episodes=3", "out=test")
+    ours, theirs = (
+        json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("run/evaluation", "test")
+    )
+    for name in FIGURES:
+        assert ours[name] == pytest.approx(theirs[name], rel=1e-4), name
+
+    command("export", "export", "checkpoint=run", "out=policy")
+    command("evaluate", "evaluate", *arguments, "checkpoint=policy", "episodes=3", "out=again")
+    again = json.loads((tmp_path / "again/metrics.json").read_text())
+    assert all(again[name] == theirs[name] for name in FIGURES)
+
+
+def test_seeds_do_not_repeat():
+    assert len(set(episode_seeds(0, 500).tolist()) | set(episode_seeds(1, 500).tolist())) == 1000

@@ -1,0 +1,259 @@
+"""The training loop and its wiring, part by part."""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import EMPTY, SMALL, compose
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.collectors import Collector
+from torchrl.envs import RewardSum, TransformedEnv
+
+from saferl.builders import STORED, build_trainer
+from saferl.envs.intersection import BatchedIntersection, Scenario
+from saferl.envs.intersection.drivers import Driver
+from saferl.hooks import CriticSignal, EpisodeSignal
+from saferl.metrics import EpisodeWindow
+from saferl.trainer import Budget, Trainer
+
+
+def trainer_of(folder: Path, *overrides: str) -> Trainer:
+    return build_trainer(compose(*SMALL, *EMPTY, *overrides), folder)
+
+
+def collect(trainer: Trainer, batches: int) -> list[TensorDict]:
+    """Run the loop's body; returns what was collected."""
+    data, iterator = [], iter(trainer.collector)
+    for _ in range(batches):
+        data.append(next(iterator))
+        trainer._take(data[-1])
+    return data
+
+
+def test_budget():
+    assert Budget(frames=200).spent(frames=50, episodes=3) == 0.25
+    assert Budget(episodes=4).spent(frames=50, episodes=9) == 1.0
+    for wrong in ({}, {"episodes": 1, "frames": 1}):
+        with pytest.raises(ValueError, match="Give one budget"):
+            Budget(**wrong)
+    with pytest.raises(ValueError, match="episodes must be >= 1, got 0"):
+        Budget(episodes=0)
+
+
+def test_random_warm_up_differs_between_environments(tmp_path: Path):
+    """A peer drew one action for all (PEERS 1)."""
+    trainer = trainer_of(tmp_path, "env.num_envs=6", "algo=sac")
+    action = collect(trainer, 1)[0]["action"]
+    assert len(action.reshape(-1, 2).unique(dim=0)) == 6
+    assert action.abs().max() <= 1 and action.std() > 0.2
+
+
+def test_threads_are_one_unless_asked_for(tmp_path: Path):
+    """PEERS 14."""
+    torch.set_num_threads(2)
+    trainer_of(tmp_path, "algo=sac")
+    assert torch.get_num_threads() == 1
+
+
+def test_updates_follow_the_frames(tmp_path: Path):
+    trainer = trainer_of(tmp_path, "algo=sac", "updates_per_frame=0.75", "warmup_frames=7")
+    counts = []
+    for _ in range(8):
+        collect(trainer, 1)
+        counts.append(trainer.progress.updates)
+    # Two frames a batch; from the fourth batch (8 frames) on, 1.5 updates each.
+    assert counts == [0, 0, 0, 1, 3, 4, 6, 7]
+
+
+def test_learning_rates_are_linear_in_the_budget(tmp_path: Path):
+    trainer = trainer_of(tmp_path, "algo=arsac", "lr.actor=[1e-2,2e-3]", "lr.critic=[1e-3,1e-3]")
+    trainer.learner.schedule(0.25)
+    rates = {group["name"]: group["lr"] for group in trainer.learner.optimizer.param_groups}
+    assert rates == pytest.approx({"actor": 8e-3, "critic": 1e-3, "alpha": 3e-4})
+    held = [id(p) for group in trainer.learner.optimizer.param_groups for p in group["params"]]
+    assert sorted(held) == sorted(id(p) for p in trainer.learner.loss.parameters())
+    assert len(set(held)) == len(held)
+
+
+def test_an_update_moves_everything_that_learns(tmp_path: Path):
+    trainer = trainer_of(tmp_path, "algo=arsac", "tau=0.25", "lagrange.multiplier.init=2.0")
+    collect(trainer, 3)
+    loss = trainer.learner.loss
+    before = {name: value.clone() for name, value in loss.state_dict().items() if _tensor(value)}
+    trainer.learner.schedule(0.0)
+    trainer.learner.update(trainer.buffer.sample())
+    after = loss.state_dict()
+    for kind in ("actor_network", "qvalue_network", "cost_critic"):
+        names = [name for name in before if name.startswith(f"{kind}_params")]
+        assert any(not torch.equal(before[name], after[name]) for name in names), kind
+    assert before["log_alpha"] != after["log_alpha"]
+    for name, value in before.items():
+        live = name.removeprefix("target_")
+        if name.startswith("target_") and value.is_floating_point():
+            torch.testing.assert_close(after[name], 0.75 * value + 0.25 * after[live])
+    # The policy that collects is the one that learns.
+    actor = dict(trainer.collector.policy.named_parameters())
+    assert any(
+        torch.equal(value, after[name])
+        for name, value in actor.items()
+        for name in [f"actor_network_params.{name}"]
+        if name in after
+    ) or {p.data_ptr() for p in actor.values()} <= {p.data_ptr() for p in loss.parameters()}
+
+
+def _tensor(value) -> bool:
+    return isinstance(value, torch.Tensor)
+
+
+def test_projector_reads_the_live_critics(tmp_path: Path):
+    trainer = trainer_of(tmp_path, "algo=rsac")
+    collect(trainer, 3)
+    projector = trainer.collector.env.transform[-1]
+    batch = trainer.buffer.sample()
+    before = projector.risk(batch.copy())["state_action_cost_value"].clone()
+    trainer.learner.update(batch)
+    assert not torch.equal(before, projector.risk(batch.copy())["state_action_cost_value"])
+
+
+def test_projector_starts_when_it_is_told(tmp_path: Path):
+    trainer = trainer_of(
+        tmp_path, "algo=rsac", "projector.start=0.5", "cost_limit=0", "updates_per_frame=0",
+        "projector.penalty=100",
+    )  # fmt: skip
+    moved = [bool(data["next", "intervened"].any()) for data in collect(trainer, 12)]
+    assert not any(moved[:6])  # 12 of 24 frames
+    if any(data["next", "risk_before"].max() > 0 for data in collect(trainer, 1)):
+        assert bool(trainer.collector.env.transform[-1].enabled)
+
+
+def test_buffer_keeps_the_executed_action_and_unscaled_reward(tmp_path: Path):
+    trainer = trainer_of(tmp_path, "algo=rsac", "cost_limit=0", "reward_scale=0.1")
+    projector = trainer.collector.env.transform[-1]
+    projector.risk = TensorDictModule(lambda action: action[..., :1] + 2, ["action"], ["risk"])
+    data = torch.cat([each.reshape(-1) for each in collect(trainer, 3)])
+    rows = trainer.buffer.storage[:6]
+    assert torch.equal(rows["action"], data["next", "action_executed"])
+    assert torch.equal(rows["action_proposed"], data["action"])
+    assert (rows["action"] != rows["action_proposed"]).any()
+    assert torch.equal(rows["next", "reward"], data["next", "reward"])
+    sample = trainer.buffer.sample()
+    stored = rows["next", "reward"][sample["index"].flatten()]
+    torch.testing.assert_close(sample["next", "reward"], 0.1 * stored)
+
+
+@pytest.mark.parametrize("late", [0, 1])
+def test_an_end_on_the_last_step_does_not_bootstrap(late: int):
+    """Success on the very step of the time limit is stored as terminated (PEERS 2); one step less
+    and it is truncated alone, which the environment's own flag says (PEERS 12)."""
+    free = BatchedIntersection(Scenario(task="rt", vehicles=0), num_envs=1, seed=3)
+    steps = free.rollout(125, Driver()).shape[-1]
+    scenario = Scenario(task="rt", vehicles=0, duration=(steps - late) / 5)
+    env = TransformedEnv(
+        BatchedIntersection(scenario, num_envs=1, seed=3),
+        RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"]),
+    )
+    data = next(iter(Collector(env, Driver(), frames_per_batch=steps + 1, total_frames=-1)))[0]
+    last = steps - late - 1
+    assert data["next", "done"].flatten().nonzero().flatten().tolist()[0] == last
+    assert bool(data["next", "truncated"][last])
+    assert bool(data["next", "terminated"][last]) == (late == 0)
+    stored = data.select(*STORED, strict=False)
+    assert torch.equal(stored["next", "terminated"], data["next", "terminated"])
+    # The final observation is the end of the road, not the start of the next episode.
+    ends, starts = data["next", "ego"][last], data["ego"][last + 1]
+    assert ends[1] > 30 and starts[2] > 40  # far east; far south
+    assert data["next", "episode_reward"][last] == pytest.approx(
+        float(data["next", "reward"][: last + 1].sum()), rel=1e-5
+    )
+    assert data["episode_reward"][last + 1] == 0
+
+
+def test_episode_signal_uses_each_fresh_episode_once(tmp_path: Path):
+    """Not a stale mean at every gradient step (PEERS 5), nothing where none ended (PEERS 10)."""
+    trainer = trainer_of(
+        tmp_path, "algo=sac_lag", "task.duration=1", "frames=200", "lagrange.multiplier.lr=0.1"
+    )
+    seen: list[list[float]] = []
+    lagrange = trainer.learner.loss.lagrange
+    update = lagrange.update
+    lagrange.update = lambda violation: (seen.append(violation.tolist()), update(violation))
+    data = collect(trainer, 12)
+    limit = compose("algo=sac_lag").lagrange.signal.cost_limit
+    ended = [each["next", "episode_cost"][each["next", "done"]] for each in data]
+    expected = [(costs - limit).tolist() for costs in ended if len(costs)]
+    assert seen == [pytest.approx(costs) for costs in expected] and len(seen) == 2
+    assert trainer.progress.updates > len(seen)
+    # Two rounds of plain signed ascent on costs of 0 (an empty road).
+    assert float(lagrange.value) == pytest.approx(1.0 - 2 * 0.1 * limit)
+
+
+def test_signals_refuse_a_loss_without_multiplier(tmp_path: Path):
+    trainer = trainer_of(tmp_path, "algo=sac")
+    for signal in (CriticSignal(), EpisodeSignal(0.1)):
+        with pytest.raises(ValueError, match="needs a loss with a multiplier"):
+            signal.register(trainer)
+    with pytest.raises(ValueError, match=r"cost_limit must be >= 0, got -1"):
+        EpisodeSignal(-1)
+
+
+def test_critic_signal_ascends_with_every_update(tmp_path: Path):
+    trainer = trainer_of(tmp_path, "algo=arsac", "lagrange.multiplier.lr=0.5", "cost_limit=0")
+    collect(trainer, 3)
+    value = float(trainer.learner.loss.lagrange.value)
+    losses = trainer.learner.update(trainer.buffer.sample())
+    assert float(trainer.learner.loss.lagrange.value) == pytest.approx(
+        value + 0.5 * float(losses["constraint_violation"]), rel=1e-6
+    )
+
+
+def test_records(tmp_path: Path):
+    """Rows at the frames they are due, means of what lies between, no wall-clock among them."""
+    trainer = trainer_of(tmp_path, "algo=arsac", "record_every=10", "logger=tensorboard")
+    means: dict[str, list[float]] = {"loss_qvalue": []}
+    add = trainer._add
+    trainer._add = lambda losses: (means["loss_qvalue"].append(float(losses["loss_qvalue"])), add(losses))
+    trainer.train()
+    with (tmp_path / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["frames"]) for row in rows] == [10, 20, 24]
+    assert {"return", "cost_return", "collision_rate", "success_rate", "lr_actor"} < rows[0].keys()
+    assert not any("second" in key or "time" in key for key in rows[0])
+    first = means["loss_qvalue"][: int(rows[0]["updates"])]
+    assert float(rows[0]["loss_qvalue"]) == pytest.approx(sum(first) / len(first), rel=1e-5)
+    assert int(rows[-1]["updates"]) == len(means["loss_qvalue"])
+    with (tmp_path / "timing.csv").open() as file:
+        timing = list(csv.DictReader(file))
+    assert all(float(row["collect"]) > 0 for row in timing) and len(timing) == 3
+
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    scalars = events.Scalars("loss_actor")
+    assert [event.step for event in scalars] == [10, 20, 24]
+    assert scalars[-1].value == pytest.approx(float(rows[-1]["loss_actor"]), rel=1e-5)
+
+
+def test_no_episode_need_end(tmp_path: Path):
+    """PEERS 10."""
+    trainer = trainer_of(tmp_path, "algo=sac_lag")
+    trainer.window = EpisodeWindow()
+    trainer.train()
+    with (tmp_path / "metrics.csv").open() as file:
+        row = next(csv.DictReader(file))
+    assert row["episodes"] == "0" and math.isnan(float(row["return"]))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("updates_per_frame", -1), ("warmup_frames", 0), ("record_every", 0), ("save_every", 0)],
+)
+def test_trainer_refuses(name: str, value: int, tmp_path: Path):
+    ours = trainer_of(tmp_path, "algo=sac")
+    parts = {key: getattr(ours, key) for key in ("run", "collector", "buffer", "learner", "budget")}
+    with pytest.raises(ValueError, match=f"{name} must be >= "):
+        Trainer(**parts, stored=STORED, **{name: value})
