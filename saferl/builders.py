@@ -10,19 +10,19 @@ from typing import Any
 import hydra
 import torch
 from omegaconf import DictConfig
+from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase, RewardScaling, RewardSum, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 from torchrl.objectives import LossModule, SoftUpdate
-from tensordict.nn import TensorDictModuleBase
 
 from saferl.checkpoint import latest, load_component
 from saferl.envs.intersection import Scenario
 from saferl.envs.transforms import ExecutedAction, SafetyProjector
 from saferl.hooks import ProjectorProgress
 from saferl.learner import Learner
-from saferl.modules import tanh_gaussian_actor, value_operator
+from saferl.modules import tanh_gaussian_actor, value_operator, zero_output
 from saferl.trainer import Budget, Trainer
 from saferl.validation import check_training
 
@@ -110,20 +110,23 @@ def build_agent(cfg: DictConfig) -> Agent:
     width = cfg.encoder.policy.width
     actor = tanh_gaussian_actor(hydra.utils.instantiate(cfg.encoder.policy), width).to(device)
 
-    def critics(members: int, out_key: str) -> list[TensorDictModuleBase]:
-        networks = (hydra.utils.instantiate(cfg.encoder.value) for _ in range(members))
-        return [value_operator(network.to(device), out_key=out_key) for network in networks]
+    def networks(members: int) -> list[torch.nn.Module]:
+        return [hydra.utils.instantiate(cfg.encoder.value).to(device) for _ in range(members)]
 
     parts = {
         "actor_network": actor,
-        "qvalue_network": critics(cfg.critic.members, "state_action_value"),
+        "qvalue_network": [value_operator(network) for network in networks(cfg.critic.members)],
         "num_qvalue_nets": cfg.critic.members,
         "target_entropy": cfg.target_entropy,
         "alpha_init": cfg.alpha_init,
     }
     if cfg.cost_critic.members:
         parts |= {
-            "cost_critic": critics(cfg.cost_critic.members, "state_action_cost_value"),
+            # At 0, or a projector would correct every action before the first cost was seen.
+            "cost_critic": [
+                value_operator(zero_output(network), out_key="state_action_cost_value")
+                for network in networks(cfg.cost_critic.members)
+            ],
             "num_cost_critics": cfg.cost_critic.members,
         }
     if cfg.lagrange.multiplier is not None:

@@ -62,7 +62,8 @@ class CollectorState:
         collector = self.collector
         self._base_env.load_state_dict(state["env"])
         if "transform" in state:
-            collector.env.transform.load_state_dict(state["transform"])
+            transform: torch.nn.Module = collector.env.transform
+            transform.load_state_dict(state["transform"])
         collector._carrier = TensorDict.from_dict(
             state["carrier"], batch_size=collector.env.batch_size, device=collector.env.device
         )
@@ -106,9 +107,8 @@ class BufferState:
             )
         buffer.empty()
         if count:
-            buffer.storage.set(
-                torch.arange(count), TensorDict.from_dict(state["rows"], batch_size=[count])
-            )
+            rows = TensorDict.from_dict(state["rows"], batch_size=[count])
+            buffer.storage.set(range(count), rows)
         buffer.writer.load_state_dict(state["writer"])
         buffer.sampler.load_state_dict(state["sampler"])
         if state["generator"] is not None:
@@ -265,7 +265,7 @@ def load_component(path: Path, module: torch.nn.Module, name: str) -> None:
     Raises:
         ValueError: the parameters do not fit; names the first that differs.
     """
-    _load(Checkpoint(**{name: Fitting(module, name)}), path)
+    _load(Checkpoint().register(name, Fitting(module, name)), path)
 
 
 class _Held:

@@ -98,9 +98,9 @@ def _unknown_key(key: str, config: str, arguments: list[str]) -> str:
         node = OmegaConf.select(composed, parent) if parent else composed
     choices = [str(k) for k in node if k != "_target_"]
     if "_target_" in node:
-        from saferl.validation import arguments  # late, as it imports the target
+        from saferl import validation  # late, as it imports the target
 
-        choices = list(arguments(node._target_) or choices)
+        choices = list(validation.arguments(node._target_) or choices)
     if name in choices:
         return f"{key!r} stands at the default of its class; set it with +{key}=..."
     close = difflib.get_close_matches(name, choices, n=1)

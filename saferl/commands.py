@@ -136,7 +136,9 @@ def choose_policy(cfg: DictConfig) -> tuple[TensorDictModuleBase, list[Transform
     Raises:
         ValueError: not exactly one source, an unknown name, or an MLP for other observations.
     """
-    given = {key: cfg[key] for key in ("checkpoint", "pretrained", "policy") if cfg[key] is not None}
+    given = {
+        key: cfg[key] for key in ("checkpoint", "pretrained", "policy") if cfg[key] is not None
+    }
     if len(given) != 1:
         got = " and ".join(f"{key}={value}" for key, value in given.items()) or "none of them"
         raise ValueError(

@@ -96,16 +96,20 @@ def episode_rows(steps: list[TensorDictBase], seeds: Tensor) -> list[dict]:
     episode, ``intervention_rate`` is the share of decisions that a projector changed, and
     ``correction`` the mean size of such a change.
     """
+
     def over_time(key: str, dtype: torch.dtype = torch.float64) -> Tensor:
         return torch.stack([step["next", key].to(dtype).squeeze(-1) for step in steps]).cpu()
 
     alive = torch.stack([step["alive"] for step in steps]).cpu()
     ego = over_time("ego")
     moved = shift = torch.zeros_like(ego[..., 0])
-    if "action_executed" in steps[0]["next"].keys():
+    if "action_executed" in steps[0]["next"]:
         moved = over_time("intervened")
         shift = torch.stack(
-            [(step["next", "action_executed"] - step["action"]).norm(dim=-1) for step in steps]
+            [
+                torch.linalg.vector_norm(step["next", "action_executed"] - step["action"], dim=-1)
+                for step in steps
+            ]
         ).cpu()
     values = {
         "return": over_time("reward"),
@@ -116,8 +120,9 @@ def episode_rows(steps: list[TensorDictBase], seeds: Tensor) -> list[dict]:
     }
     ends = {key: over_time(key, torch.bool) for key in ("collision", "offroad", "success")}
     rows = []
+    routes = steps[0].get("route").flatten().tolist()
     for index, (seed, route, count) in enumerate(
-        zip(seeds.tolist(), steps[0]["route"].flatten().tolist(), alive.sum(0).tolist(), strict=True)
+        zip(seeds.tolist(), routes, alive.sum(0).tolist(), strict=True)
     ):
         # Exact sums: they do not depend on how long the episodes beside this one lasted.
         total = {key: math.fsum(value[:count, index].tolist()) for key, value in values.items()}

@@ -38,7 +38,9 @@ class Learner:
         self._forward = torch.compile(loss) if compile else loss
         if compile:
             log.info("Compiling the loss at its first update: this takes about a minute.")
-            warnings.filterwarnings("ignore", category=UserWarning, module="tensordict|torch._dynamo")
+            warnings.filterwarnings(
+                "ignore", category=UserWarning, module="tensordict|torch._dynamo"
+            )
 
     def schedule(self, spent: float) -> None:
         """Set the learning rates for a fraction of the budget."""
@@ -49,8 +51,8 @@ class Learner:
     def update(self, batch: TensorDictBase) -> TensorDict:
         """Returns the loss terms and metrics, detached scalars."""
         losses = self._forward(batch)
-        total = sum(value for key, value in losses.items() if key.startswith("loss_"))
-        total.backward()
+        terms = [value for key, value in losses.items() if key.startswith("loss_")]
+        torch.stack(terms).sum().backward()
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.target_updater.step()

@@ -36,7 +36,8 @@ def finished_episodes(data: TensorDictBase) -> TensorDict:
         [n] TensorDict of float ``return``, ``cost_return``, ``collision`` (with a vehicle or off the
         road), ``success`` and ``frozen``.
     """
-    ends = data["next"][data["next", "done"].squeeze(-1)]
+    after = data.get("next")
+    ends = after[after["done"].squeeze(-1)]
     collision = (ends["collision"] | ends["offroad"]).squeeze(-1).float()
     success = ends["success"].squeeze(-1).float()
     return TensorDict(

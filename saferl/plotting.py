@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import matplotlib
@@ -12,12 +13,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.patches import Circle, Polygon, Rectangle
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 from PIL import Image
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from saferl.envs.intersection import IntersectionBase
 from saferl.envs.intersection.geometry import (
     CURB_RADIUS,
     HALF_BOX,
@@ -83,6 +86,7 @@ def record(policy: TensorDictModuleBase, env: EnvBase, seed: int) -> Episode:
     if env.batch_size != torch.Size([1]):
         raise ValueError(f"record needs num_envs=1, got batch size {tuple(env.batch_size)}.")
     base = env.base_env if isinstance(env, TransformedEnv) else env
+    assert isinstance(base, IntersectionBase)
     tensordict = start(env, torch.tensor([seed], device=env.device))
     episode = Episode(seed, ROUTES[int(tensordict["route"])], 1.0 / base.scenario.policy_frequency)
 
@@ -127,6 +131,7 @@ def draw(policy: TensorDictModuleBase, env: EnvBase, row: dict, out: Path) -> Pa
 def save_gif(episode: Episode, path: Path) -> Path:
     """Write an endless GIF in real time, five to ten pictures a second; the last one stays a second."""
     figure, axes = plt.subplots(figsize=(_GIF["size"],) * 2, dpi=_GIF["dpi"])
+    canvas = FigureCanvasAgg(figure)
     figure.subplots_adjust(0, 0, 1, 0.93)
     draw_road(axes, bare=True)
     _reference(axes, episode)
@@ -141,13 +146,13 @@ def save_gif(episode: Episode, path: Path) -> Path:
         cars += _rectangles(axes, episode.ego[index], EGO, edge=CORRECTED if corrected else "white")
         end = f"  {episode.outcome}" if index == last else "  corrected" if corrected else ""
         head.set_text(f"{index * episode.dt:4.1f} s  {episode.speed[index]:4.1f} m/s{end}")
-        figure.canvas.draw()
-        picture = np.asarray(figure.canvas.buffer_rgba())[..., :3]
+        canvas.draw()
+        picture = np.asarray(canvas.buffer_rgba())[..., :3]
         images.append(Image.fromarray(picture).quantize(_GIF["colours"], dither=Image.Dither.NONE))
         for car in cars:
             car.remove()
     plt.close(figure)
-    duration = [round(1000 * episode.dt * (b - a)) for a, b in zip(shown, shown[1:], strict=False)]
+    duration = [round(1000 * episode.dt * (b - a)) for a, b in pairwise(shown)]
     images[0].save(
         path,
         save_all=True,
@@ -190,7 +195,7 @@ def draw_road(axes: Axes, bare: bool = False) -> None:
 
 def _rectangles(
     axes: Axes, states: np.ndarray, colour: str, alpha: float = 1.0, zorder: float = 3, edge="white"
-) -> list[Polygon]:
+) -> list[Patch]:
     return [
         axes.add_patch(
             Polygon(
@@ -243,7 +248,12 @@ def draw_speed(axes: Axes, episode: Episode) -> None:
     inside = np.flatnonzero(np.abs(ego[:, :2]).max(1) <= HALF_BOX)
     if len(inside):
         axes.axvspan(
-            time[inside[0]], time[inside[-1]], color=ROAD, lw=0, label="in the box", zorder=0
+            float(time[inside[0]]),
+            float(time[inside[-1]]),
+            color=ROAD,
+            lw=0,
+            label="in the box",
+            zorder=0,
         )
     axes.plot(time, speed, color=EGO, lw=1.8, label="ego")
     corrected = np.flatnonzero(episode.corrected)

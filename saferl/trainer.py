@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -50,8 +49,13 @@ class Budget:
 
     def spent(self, frames: int, episodes: int) -> float:
         """Fraction of the budget that is spent, in [0, 1]."""
-        done, whole = (episodes, self.episodes) if self.episodes else (frames, self.frames)
-        return min(1.0, done / whole)
+        done = episodes if self.episodes else frames
+        return min(1.0, done / self.whole)
+
+    @property
+    def whole(self) -> int:
+        """The number of episodes or frames."""
+        return self.episodes or self.frames or 0
 
 
 @dataclass
@@ -103,7 +107,9 @@ def _interrupts() -> Iterator[list[int]]:
 
     def note(number: int, frame: object) -> None:
         if received:
-            raise KeyboardInterrupt("Interrupted twice: what came after the last checkpoint is lost.")
+            raise KeyboardInterrupt(
+                "Interrupted twice: what came after the last checkpoint is lost."
+            )
         received.append(number)
 
     if threading.current_thread() is not threading.main_thread():
@@ -212,7 +218,7 @@ class Trainer:
         if progress.last_save < 0:
             self.save()
         bar = tqdm(
-            total=self.budget.episodes or self.budget.frames,
+            total=self.budget.whole,
             initial=progress.episodes if by_episode else progress.frames,
             unit="episode" if by_episode else "frame",
             desc="train",

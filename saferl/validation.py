@@ -24,16 +24,16 @@ TRAINING = {
     "compile": (bool, 0, 1),
     "episodes": (int | None, 1, math.inf),
     "frames": (int | None, 1, math.inf),
-    "gamma": (float, 0.0, 1.0),
-    "cost_limit": (float, 0.0, math.inf),
+    "gamma": (float, 0, 1),
+    "cost_limit": (float, 0, math.inf),
     "batch_size": (int, 1, math.inf),
     "buffer_size": (int, 1, math.inf),
     "warmup_frames": (int, 1, math.inf),
-    "updates_per_frame": (float, 0.0, math.inf),
-    "reward_scale": (float, 0.0, math.inf),
-    "tau": (float, 0.0, 1.0),
-    "target_entropy": (Union[Literal["auto"], float], -math.inf, math.inf),
-    "alpha_init": (float, 0.0, math.inf),
+    "updates_per_frame": (float, 0, math.inf),
+    "reward_scale": (float, 0, math.inf),
+    "tau": (float, 0, 1),
+    "target_entropy": (Literal["auto"] | float, -math.inf, math.inf),
+    "alpha_init": (float, 0, math.inf),
     "record_every": (int, 1, math.inf),
     "save_every": (int, 1, math.inf),
     "evaluation.episodes": (int, 1, math.inf),
@@ -103,7 +103,7 @@ def check_numbers(cfg: DictConfig, table: dict[str, tuple[Any, float, float]]) -
             continue
         allowed = describe(kind)
         if fits(0, kind) and low > -math.inf:
-            more = "> 0" if key in POSITIVE else f">= {low:g}"
+            more = "> 0" if key in POSITIVE else f">= {low}"
             allowed += f", {more}" if high == math.inf else f", {more} and <= {high}"
         raise ValueError(f"{key} must be {allowed}, got {value!r}.")
 
@@ -116,6 +116,7 @@ def check_keys(cfg: DictConfig) -> None:
     """
     root = Path(config_dir())
     primary = OmegaConf.load(root / "config.yaml")
+    assert isinstance(primary, DictConfig)
     groups = {folder.name for folder in root.iterdir() if folder.is_dir()} - {"hydra"}
     known = (set(primary) | groups | {"algo_name"}) - {"defaults", "hydra", "algo", "experiment"}
     _refuse_unknown(cfg, known, "")

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 from conftest import EMPTY, SMALL, compose
+from omegaconf import OmegaConf
+from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
@@ -33,7 +35,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     cfg = compose(*SMALL, *EMPTY, "algo=rsac", "task.duration=2")
     build_trainer(cfg, folder).train()
-    (folder / CONFIG).write_text(__import__("omegaconf").OmegaConf.to_yaml(cfg, resolve=True))
+    OmegaConf.save(cfg, folder / CONFIG, resolve=True)
     return folder
 
 
@@ -115,8 +117,6 @@ def test_buffer_continues_where_it_was(written: int):
         )
 
     def transitions(start: int, count: int):
-        from tensordict import TensorDict
-
         values = torch.arange(start, start + count)
         return TensorDict({"x": values, "next": {"y": values[:, None] > 2}}, [count])
 
@@ -134,8 +134,6 @@ def test_buffer_continues_where_it_was(written: int):
 
 
 def test_buffer_too_small_is_refused():
-    from tensordict import TensorDict
-
     ours = TensorDictReplayBuffer(storage=LazyTensorStorage(8), batch_size=1)
     ours.extend(TensorDict({"x": torch.zeros(6)}, [6]))
     small = TensorDictReplayBuffer(storage=LazyTensorStorage(4), batch_size=1)
@@ -161,14 +159,16 @@ def test_another_architecture_names_the_parameter_and_the_way_out(run: Path):
     message = str(refused.value)
     for part in ("actor_network_params", "[16]", "[24]", "more)", "config.yaml", str(run)):
         assert part in message
-    with pytest.raises(ValueError, match="cost_critic_params.* in the checkpoint and absent here"):
+    with pytest.raises(ValueError, match=r"cost_critic_params.* in the checkpoint and absent here"):
         load_agent(compose(*SMALL, *EMPTY, "algo=sac"), run, "init")
 
 
 def test_fitting_counts_differences():
     ours = Fitting(torch.nn.Linear(2, 3), "critic")
     state = torch.nn.Linear(2, 4).state_dict() | {"extra": torch.zeros(1)}
-    with pytest.raises(ValueError, match=r"another critic: bias is \[4\] .* \[3\] here \(and 2 more"):
+    with pytest.raises(
+        ValueError, match=r"another critic: bias is \[4\] .* \[3\] here \(and 2 more"
+    ):
         ours.load_state_dict(state)
 
 
@@ -180,12 +180,12 @@ def test_folders(run: Path, tmp_path: Path):
         latest(tmp_path / "none", "init")
     with pytest.raises(FileNotFoundError, match="holds no checkpoint"):
         latest(tmp_path)
-    with pytest.raises(FileNotFoundError, match="no config.yaml"):
+    with pytest.raises(FileNotFoundError, match=r"no config\.yaml"):
         run_folder(tmp_path)
     # The configuration of an outer folder is somebody else's.
     (tmp_path / CONFIG).touch()
     (tmp_path / "inner").mkdir()
-    with pytest.raises(FileNotFoundError, match="no config.yaml"):
+    with pytest.raises(FileNotFoundError, match=r"no config\.yaml"):
         run_folder(tmp_path / "inner")
 
 

@@ -90,7 +90,11 @@ def test_figures_against_gymnasium_by_hand():
     assert row["speed"] == pytest.approx(sum(speeds) / len(speeds), rel=1e-5)
     assert row["min_distance"] == pytest.approx(min(distances), rel=1e-5)
     assert row["route"] == info["route"]
-    for key, flag in (("hit_vehicle", "collision"), ("left_road", "offroad"), ("success", "success")):
+    for key, flag in (
+        ("hit_vehicle", "collision"),
+        ("left_road", "offroad"),
+        ("success", "success"),
+    ):
         assert row[key] == info[flag]
     assert row["collision"] == (info["collision"] or info["offroad"])
     assert row["collision"] + row["success"] + row["frozen"] == 1
@@ -149,7 +153,8 @@ def test_a_runs_closing_test_is_the_evaluation_of_its_checkpoint(tmp_path: Path,
     command("train", "config", *SMALL, *arguments, *algo, "evaluation.episodes=3", "out=run")
     command("evaluate", "evaluate", *arguments, "checkpoint=run", "episodes=3", "out=test")
     ours, theirs = (
-        json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("run/evaluation", "test")
+        json.loads((tmp_path / name / "metrics.json").read_text())
+        for name in ("run/evaluation", "test")
     )
     for name in FIGURES:
         assert ours[name] == pytest.approx(theirs[name], rel=1e-4), name

@@ -42,7 +42,8 @@ def test_mean_interval_by_hand():
 
 def episode(**values: float) -> dict[str, float]:
     row = dict.fromkeys(
-        ("collision", "success", "frozen", "return", "speed", "cost_return", "intervention_rate"), 0.0
+        ("collision", "success", "frozen", "return", "speed", "cost_return", "intervention_rate"),
+        0.0,
     )
     return row | values
 

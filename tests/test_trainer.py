@@ -97,13 +97,8 @@ def test_an_update_moves_everything_that_learns(tmp_path: Path):
         if name.startswith("target_") and value.is_floating_point():
             torch.testing.assert_close(after[name], 0.75 * value + 0.25 * after[live])
     # The policy that collects is the one that learns.
-    actor = dict(trainer.collector.policy.named_parameters())
-    assert any(
-        torch.equal(value, after[name])
-        for name, value in actor.items()
-        for name in [f"actor_network_params.{name}"]
-        if name in after
-    ) or {p.data_ptr() for p in actor.values()} <= {p.data_ptr() for p in loss.parameters()}
+    learned = {parameter.data_ptr() for parameter in loss.parameters()}
+    assert {parameter.data_ptr() for parameter in trainer.collector.policy.parameters()} <= learned
 
 
 def _tensor(value) -> bool:
@@ -120,21 +115,21 @@ def test_projector_reads_the_live_critics(tmp_path: Path):
     assert not torch.equal(before, projector.risk(batch.copy())["state_action_cost_value"])
 
 
+def always_risky(trainer: Trainer) -> None:
+    risk = TensorDictModule(lambda action: action[..., :1] + 2, ["action"], ["risk"])
+    trainer.collector.env.transform[-1].risk = risk
+
+
 def test_projector_starts_when_it_is_told(tmp_path: Path):
-    trainer = trainer_of(
-        tmp_path, "algo=rsac", "projector.start=0.5", "cost_limit=0", "updates_per_frame=0",
-        "projector.penalty=100",
-    )  # fmt: skip
+    trainer = trainer_of(tmp_path, "algo=rsac", "projector.start=0.5", "projector.penalty=100")
+    always_risky(trainer)
     moved = [bool(data["next", "intervened"].any()) for data in collect(trainer, 12)]
-    assert not any(moved[:6])  # 12 of 24 frames
-    if any(data["next", "risk_before"].max() > 0 for data in collect(trainer, 1)):
-        assert bool(trainer.collector.env.transform[-1].enabled)
+    assert moved == [False] * 6 + [True] * 6  # half of 24 frames, two a batch
 
 
 def test_buffer_keeps_the_executed_action_and_unscaled_reward(tmp_path: Path):
     trainer = trainer_of(tmp_path, "algo=rsac", "cost_limit=0", "reward_scale=0.1")
-    projector = trainer.collector.env.transform[-1]
-    projector.risk = TensorDictModule(lambda action: action[..., :1] + 2, ["action"], ["risk"])
+    always_risky(trainer)
     data = torch.cat([each.reshape(-1) for each in collect(trainer, 3)])
     rows = trainer.buffer.storage[:6]
     assert torch.equal(rows["action"], data["next", "action_executed"])
@@ -216,7 +211,10 @@ def test_records(tmp_path: Path):
     trainer = trainer_of(tmp_path, "algo=arsac", "record_every=10", "logger=tensorboard")
     means: dict[str, list[float]] = {"loss_qvalue": []}
     add = trainer._add
-    trainer._add = lambda losses: (means["loss_qvalue"].append(float(losses["loss_qvalue"])), add(losses))
+    trainer._add = lambda losses: (
+        means["loss_qvalue"].append(float(losses["loss_qvalue"])),
+        add(losses),
+    )
     trainer.train()
     with (tmp_path / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))

@@ -1,7 +1,7 @@
 """Networks, critics, multipliers and the projection that algorithms are composed of."""
 
 from saferl.modules.actors import GaussianHead, tanh_gaussian_actor
-from saferl.modules.critics import CriticEnsemble, StateValue, value_operator
+from saferl.modules.critics import CriticEnsemble, StateValue, value_operator, zero_output
 from saferl.modules.lagrange import DualAscent, LagrangeMultiplier, PIDMultiplier
 from saferl.modules.mlp import MLPPolicyEncoder, MLPValue
 from saferl.modules.mmam import EGO_SCALE, VEHICLE_SCALE, MMAMPolicyEncoder, MMAMValue
@@ -24,4 +24,5 @@ __all__ = [
     "project",
     "tanh_gaussian_actor",
     "value_operator",
+    "zero_output",
 ]

@@ -44,6 +44,39 @@ class StateValue(nn.Module):
         return self.head(self.encoder(*inputs))
 
 
+def zero_output(network: nn.Module) -> nn.Module:
+    """Sets the read-out weights of a value network to 0, so that its value begins at exactly 0.
+
+    A cost critic that begins at random calls actions risky before it has seen a cost: a projector
+    then corrects nearly every one of them, and a multiplier pushes the policy away from nothing.
+
+    Args:
+        network: a module whose read-outs are its linear layers with one output, such as
+            :class:`MMAMValue` or :class:`MLPValue`; changed in place and returned.
+
+    Raises:
+        ValueError: the network has no such layer.
+
+    Examples:
+        >>> import torch
+        >>> from saferl.modules import MLPValue, zero_output
+        >>> value = zero_output(MLPValue(rows=3, width=32))
+        >>> value(torch.randn(5, 9), torch.zeros(5, 3, 6), torch.ones(5, 2)).abs().max().item()
+        0.0
+    """
+    readouts = [
+        module
+        for module in network.modules()
+        if isinstance(module, nn.Linear) and module.out_features == 1
+    ]
+    if not readouts:
+        raise ValueError(f"{type(network).__name__} has no linear layer with one output.")
+    for layer in readouts:
+        for parameter in layer.parameters():
+            nn.init.zeros_(parameter)
+    return network
+
+
 def value_operator(
     network: nn.Module,
     in_keys: Sequence[NestedKey] = ("ego", "vehicles", "action"),

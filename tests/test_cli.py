@@ -1,0 +1,223 @@
+"""The commands as a user types them."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from pathlib import Path
+
+import hydra
+import pytest
+from conftest import EMPTY, SMALL, compose
+from omegaconf import OmegaConf
+
+from saferl.builders import build_trainer
+from saferl.checkpoint import CONFIG
+from saferl.trainer import _interrupts
+
+TRAIN, TEST, EXPORT = ("train", "config"), ("evaluate", "evaluate"), ("export", "export")
+
+MISTAKES = [
+    (TRAIN, "algo=foo", "algo must be one of arsac, asac, rsac, sac, sac_lag, sac_rs, got 'foo'"),
+    (TRAIN, "task=foo", "task must be one of gs, lt, mixed, rt, got 'foo'"),
+    (TRAIN, "encoder=foo", "encoder must be one of mlp, mmam, got 'foo'"),
+    (TRAIN, "env=foo", "env must be one of batched, highway, got 'foo'"),
+    (TRAIN, "experiment=foo", "quickstart"),
+    (TRAIN, "gama=0.9", "unknown key 'gama' (did you mean gamma?); choose from seed, "),
+    (
+        TRAIN,
+        "task.vehicels=3",
+        "unknown key 'task.vehicels' (did you mean vehicles?); choose from task",
+    ),
+    (TRAIN, "task.cost.steps=3", "set it with +task.cost.steps"),
+    (TRAIN, "+task.foo=1", "unknown key task.foo: "),
+    (TRAIN, "+foo=1", "unknown key foo; choose from "),
+    (TRAIN, "gamma", "Error parsing override 'gamma'"),
+    (TRAIN, "gamma=1.2", "gamma must be a number, >= 0 and <= 1, got 1.2"),
+    (TRAIN, "gamma=abc", "gamma must be a number, >= 0 and <= 1, got 'abc'"),
+    (TRAIN, "gamma=nan", "got nan"),
+    (TRAIN, "cost_limit=-1", "cost_limit must be a number, >= 0, got -1"),
+    (TRAIN, "episodes=0", "episodes must be a whole number or null, >= 1, got 0"),
+    (TRAIN, "episodes=null", "Give one budget, episodes or frames"),
+    (TRAIN, "frames=10", "Give one budget, episodes or frames"),
+    (TRAIN, "device=foo", "device must be one of auto, cpu, cuda, got 'foo'"),
+    (TRAIN, "seed=-1", "seed must be a whole number, >= 0 and <= 2147483647, got -1"),
+    (TRAIN, "lr.actor=0.1", "lr.actor must be [first, last], both >= 0, got 0.1"),
+    (TRAIN, "lr.actor=[1e-3,-1]", "lr.actor must be [first, last], both >= 0, got [0.001, -1]"),
+    (TRAIN, "updates_per_frame=-1", "updates_per_frame must be a number, >= 0, got -1"),
+    (TRAIN, "buffer_size=10", "buffer_size must be >= batch_size, got 10 and 256"),
+    (TRAIN, "alpha_init=0", "alpha_init must be a number, > 0, got 0"),
+    (TRAIN, "evaluation.episodes=0", "evaluation.episodes must be a whole number, >= 1, got 0"),
+    (TRAIN, "projector.step_size=-1", "step_size must be finite and > 0, got -1"),
+    (TRAIN, "task.reward.reading=foo", "reading must be one of normalised, raw, got 'foo'"),
+    (TRAIN, "task.vehicles=abc", "task.vehicles must be a whole number, got 'abc'"),
+    (TRAIN, "env.num_envs=abc", "env.num_envs must be a whole number, got 'abc'"),
+    (TRAIN, "encoder.policy.heads=3", "width must be a multiple of heads, got 256 and 3"),
+    (TRAIN, "lagrange.multiplier.lr=-1", "lr must be finite and > 0, got -1"),
+    (TRAIN, "env=batched", "vehicles must be 0, got 10. Use env=highway"),
+    (TRAIN, "loss=sac", "takes no cost_critic: set cost_critic=none, or loss=sac_lag"),
+    (TRAIN, "algo=sac loss=sac_lag", "needs cost_critic, got cost_critic=none"),
+    (TRAIN, "algo=sac projector=gradient", "projector needs cost critics"),
+    (TRAIN, "resume=missing", "resume: no config.yaml in missing"),
+    (TRAIN, "init=missing", "init: no such file or folder: missing"),
+    (
+        TEST,
+        "",
+        "Give one of checkpoint=PATH, pretrained=NAME or policy=random|blind|scripted, got none",
+    ),
+    (TEST, "policy=blind checkpoint=x", "got checkpoint=x and policy=blind"),
+    (TEST, "policy=foo", "policy must be one of random, blind, scripted, got 'foo'"),
+    (TEST, "pretrained=foo", "pretrained"),
+    (TEST, "checkpoint=missing", "checkpoint: no such file or folder: missing"),
+    (TEST, "policy=blind episodes=0", "episodes must be a whole number, >= 1, got 0"),
+    (TEST, "policy=blind task=foo", "task must be one of gs, lt, mixed, rt, got 'foo'"),
+    (TEST, "policy=blind foo=1", "unknown key 'foo'; choose from task, env, checkpoint"),
+    (TEST, "policy=blind env=batched", "vehicles must be 0, got 10"),
+    (EXPORT, "", "checkpoint=... is missing"),
+    (EXPORT, "checkpoint=missing out=x", "checkpoint: no such file or folder: missing"),
+]
+
+
+@pytest.mark.parametrize(
+    ("command_name", "arguments", "message"), MISTAKES, ids=[f"{m[0][0]} {m[1]}" for m in MISTAKES]
+)
+def test_mistake_is_one_line_and_leaves_nothing(
+    command_name, arguments, message, refusal, tmp_path: Path
+):
+    line = refusal(*command_name, *arguments.split())
+    assert message in line
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_missing_logger_is_named(refusal, monkeypatch):
+    """Whether or not W&B is installed here."""
+
+    def instantiate(node, **kwargs):
+        if "Wandb" in str(node.get("_target_")):
+            raise ImportError("wandb could not be imported")
+        return real(node, **kwargs)
+
+    real = hydra.utils.instantiate
+    monkeypatch.setattr(hydra.utils, "instantiate", instantiate)
+    line = refusal(*TRAIN, "logger=wandb", "encoder.policy.width=16")
+    assert "WandbLogger needs a package that is not installed" in line and "pip install" in line
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of SAC on an empty road."""
+    folder = tmp_path_factory.mktemp("run")
+    cfg = compose(*SMALL, *EMPTY, "algo=sac", "task.rows=2")
+    build_trainer(cfg, folder).train()
+    OmegaConf.save(cfg, folder / CONFIG, resolve=True)
+    return folder
+
+
+def test_a_run_is_not_written_over_nor_reconfigured(run: Path, refusal):
+    assert "holds a run already; continue it with resume=" in refusal(*TRAIN, f"out={run}")
+    line = refusal(*TRAIN, f"resume={run}", "gamma=0.9", "out=x")
+    assert "takes no other option, got gamma=0.9, out=x" in line
+    line = refusal(*TRAIN, *SMALL, *EMPTY, f"init={run}", "algo=sac", "encoder.policy.width=24")
+    assert "[16] in the checkpoint and [24] here" in line and "config.yaml" in line
+    assert "task.rows must be 2" in refusal(*TEST, f"checkpoint={run}")
+
+
+def test_init_begins_from_the_networks(run: Path, tmp_path: Path):
+    trainer = build_trainer(
+        compose(*SMALL, *EMPTY, "algo=sac", "task.rows=2", "seed=9", f"init={run}"), tmp_path
+    )
+    other = build_trainer(compose(*SMALL, *EMPTY, "algo=sac", "task.rows=2"), run)
+    other.resume()
+    ours, theirs = (t.learner.loss.state_dict() for t in (trainer, other))
+    assert all((ours[key] == theirs[key]).all() for key in ours if hasattr(ours[key], "shape"))
+    assert trainer.progress.frames == 0 and trainer.collector.init_random_frames == 0
+
+
+def test_train_from_any_folder_then_multirun(command, tmp_path: Path, capsys):
+    command(*TRAIN, *SMALL, *EMPTY, "algo=sac", "out=mine", "logger=tensorboard")
+    names = {path.name for path in (tmp_path / "mine").iterdir()}
+    assert names == {
+        "checkpoints", "config.yaml", "evaluation", "metrics.csv", "tensorboard", "timing.csv",
+    }  # fmt: skip
+    assert {path.name for path in tmp_path.iterdir()} == {"mine"}
+    assert "SR" in capsys.readouterr().out
+
+    command(*TRAIN, "-m", *SMALL, *EMPTY, "algo=sac,asac", "seed=0,1", "frames=8", "out=many")
+    jobs = sorted(path for path in (tmp_path / "many").iterdir() if path.is_dir())
+    assert [job.name for job in jobs] == ["0", "1", "2", "3"]
+    made = [(job / CONFIG).read_text() for job in jobs]
+    assert ["algo_name: sac\n" in text for text in made] == [True, True, False, False]
+    assert [f"seed: {seed}\n" in text for seed, text in zip((0, 1, 0, 1), made, strict=True)] == [
+        True
+    ] * 4
+    assert all((job / "evaluation/metrics.json").is_file() for job in jobs)
+
+
+def test_run_folder_has_a_name_that_shells_like(command, tmp_path: Path):
+    command(*TRAIN, *SMALL, *EMPTY, "algo=sac", "frames=8", "seed=3")
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert folder.name == "sac-gs-seed3"
+    (run,) = folder.iterdir()
+    assert "=" not in str(run.relative_to(tmp_path)) and (run / "metrics.csv").is_file()
+
+
+@pytest.mark.parametrize("policy", ["random", "blind", "scripted"])
+def test_evaluate_a_driver(policy: str, command, tmp_path: Path):
+    command(*TEST, f"policy={policy}", *EMPTY, "episodes=3", "seed=2", "task=rt", "out=there")
+    figures = json.loads((tmp_path / "there/metrics.json").read_text())
+    for name in (
+        "collision_rate", "success_rate", "frozen_rate", "return", "speed", "cost_return",
+        "intervention_rate",
+    ):  # fmt: skip
+        assert set(figures[name]) == {"mean", "low", "high"}
+        assert figures[name]["low"] <= figures[name]["mean"] <= figures[name]["high"]
+        assert not name.endswith("_rate") or 0 <= figures[name]["low"] <= figures[name]["high"] <= 1
+    assert figures["success_rate"]["mean"] == (0.0 if policy == "random" else 1.0)
+    assert (tmp_path / "there/episodes.csv").read_text().count("\n") == 4
+
+
+def test_help_lists_groups_and_settings(command, capsys):
+    with pytest.raises(SystemExit) as left:
+        command(*TRAIN, "--help")
+    assert not left.value.code
+    text = capsys.readouterr().out
+    assert "python -m saferl algo=arsac task=gs" in text
+    assert "algo: arsac, asac, rsac, sac, sac_lag, sac_rs" in text and "gamma: 0.99" in text
+
+
+def test_interrupt_leaves_a_checkpoint_that_loads(spawn, tmp_path: Path):
+    """Ctrl-C once; exit 130 and a line that says how to go on, which then works."""
+    options = (*SMALL, *EMPTY, "algo=sac", "frames=1000000", "save_every=1000000", "out=run")
+    process = spawn("saferl", *options)
+    metrics = tmp_path / "run/metrics.csv"
+    while not metrics.exists() or metrics.read_text().count("\n") < 3:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=300)
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    assert "Continue with resume=" in err.splitlines()[-1]
+
+    trainer = build_trainer(compose(*options[:-1]), tmp_path / "run")
+    trainer.resume()
+    assert trainer.progress.updates > 0 and trainer.progress.frames >= 16
+    assert len(trainer.buffer) == min(64, trainer.progress.frames)
+
+
+def test_second_interrupt_ends_at_once(tmp_path: Path):
+    """Even while a step lasts for ever."""
+    with pytest.raises(KeyboardInterrupt, match="twice"), _interrupts() as received:
+        signal.raise_signal(signal.SIGINT)
+        assert received == [signal.SIGINT]
+        signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_mistake_in_a_process_of_its_own(spawn, tmp_path: Path):
+    process = spawn("saferl", "gamma=1.2", "out=run")
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 1 and out == ""
+    assert err == "error: gamma must be a number, >= 0 and <= 1, got 1.2.\n"
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,132 @@
+"""Every option of every group composes, and every composition builds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from conftest import SMALL, compose
+from omegaconf import OmegaConf
+
+from saferl.builders import build_agent, build_trainer
+from saferl.modules import MLPPolicyEncoder, MMAMPolicyEncoder
+from saferl.paths import config_dir
+from saferl.validation import arguments, check_testing, check_training, fits
+
+ROOT = Path(config_dir())
+OPTIONS = sorted(
+    f"{path.parent.name}={path.stem}"
+    for path in ROOT.glob("*/*.yaml")
+    if path.parent.name != "hydra"
+)
+ALGOS = sorted(path.stem for path in (ROOT / "algo").glob("*.yaml"))
+#: Encoder, cost critics, multiplier's signal, projector, r_safe: the table of the paper.
+PARTS = {
+    "arsac": (MMAMPolicyEncoder, 2, "CriticSignal", True, False),
+    "rsac": (MLPPolicyEncoder, 2, "CriticSignal", True, False),
+    "asac": (MMAMPolicyEncoder, 0, None, False, False),
+    "sac": (MLPPolicyEncoder, 0, None, False, False),
+    "sac_rs": (MLPPolicyEncoder, 0, None, False, True),
+    "sac_lag": (MLPPolicyEncoder, 2, "EpisodeSignal", False, False),
+}
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+def test_option_composes_and_is_checked(option: str):
+    """Each option, with the parts that it needs beside it, passes the check of what it says."""
+    check_training(compose(option))
+
+
+@pytest.mark.parametrize("option", [o for o in OPTIONS if o.startswith(("task=", "env="))])
+def test_option_of_the_evaluation(option: str):
+    cfg = compose(option, config="evaluate")
+    check_testing(cfg)
+    assert cfg.task.policy_frequency == 10 and cfg.task.route_starts == 0.0
+    assert cfg.task.standstill is None and not cfg.task.reward.get("risk_shaping", False)
+    assert {"checkpoint", "pretrained", "policy", "episodes", "seed", "out"} <= set(cfg)
+
+
+def test_help_of_the_evaluation_lists_its_choices():
+    template = OmegaConf.load(ROOT / "evaluate.yaml").hydra.help.template
+    for group in ("task", "env"):
+        choices = ", ".join(sorted(path.stem for path in (ROOT / group).glob("*.yaml")))
+        assert f"{group}: {choices}\n" in template
+
+
+def test_every_file_is_an_option_of_a_known_group():
+    groups = {path.name for path in ROOT.iterdir() if path.is_dir()}
+    assert groups == {
+        "algo", "collector", "cost_critic", "critic", "encoder", "env", "experiment", "hydra",
+        "lagrange", "logger", "loss", "projector", "shaping", "task",
+    }  # fmt: skip
+    assert not list(ROOT.rglob("__init__.py"))  # a package of YAML would be shipped as code
+    assert set(ALGOS) >= set(PARTS)
+
+
+@pytest.mark.parametrize("algo", ALGOS)
+@pytest.mark.parametrize("env", ["highway", "batched"])
+def test_algorithm_builds_and_makes_updates(algo: str, env: str, tmp_path: Path):
+    vehicles = 3 if env == "highway" else 0
+    cfg = compose(*SMALL, f"algo={algo}", f"env={env}", f"task.vehicles={vehicles}", "frames=12")
+    trainer = build_trainer(cfg, tmp_path)
+    trainer.train()
+    assert trainer.progress.frames >= 12 and trainer.progress.updates >= 2
+    assert (tmp_path / "metrics.csv").read_text().count("\n") >= 2
+
+
+@pytest.mark.parametrize("algo", sorted(PARTS))
+def test_composition_is_the_papers(algo: str):
+    encoder, cost_critics, signal, projector, shaping = PARTS[algo]
+    cfg = compose(f"algo={algo}", "encoder.policy.width=16")
+    agent = build_agent(cfg)
+    assert cfg.algo_name == algo
+    assert isinstance(next(m for m in agent.actor.modules() if isinstance(m, encoder)), encoder)
+    assert cfg.cost_critic.members == cost_critics
+    assert hasattr(agent.loss, "lagrange") == (signal is not None)
+    assert signal is None or cfg.lagrange.signal._target_.endswith(signal)
+    assert (agent.projector is not None) == projector
+    assert cfg.task.reward.get("risk_shaping", False) == shaping
+
+
+@pytest.mark.parametrize("option", [o for o in OPTIONS if o.startswith("experiment=")])
+@pytest.mark.parametrize("algo", ["arsac", "sac"])
+def test_preset_builds_with_either_kind_of_algorithm(option: str, algo: str, tmp_path: Path):
+    cfg = compose(option, f"algo={algo}", "encoder.policy.width=16", "logger=none", "compile=false")
+    build_trainer(cfg, tmp_path)
+
+
+def test_command_line_beats_preset_beats_algorithm():
+    cfg = compose("experiment=quickstart", "algo=sac", "encoder=mmam", "episodes=7")
+    assert cfg.episodes == 7
+    assert cfg.encoder.policy._target_.endswith("MMAMPolicyEncoder")
+    assert cfg.env._target_.endswith("BatchedIntersection")
+
+
+def test_a_typo_in_a_preset_is_refused():
+    """Hydra lets files add keys; only the check can tell."""
+    for key, value, message in (
+        ("gama", 0.9, "unknown key gama; choose from .*gamma"),
+        ("lr.actr", [1, 2], "unknown key lr.actr; choose from actor, alpha, critic"),
+        ("evaluation.episode", 1, "unknown key evaluation.episode"),
+        ("critic.member", 2, "unknown key critic.member"),
+        ("encoder.value.depht", 3, r"unknown key encoder.value.depht: .* takes .*width"),
+        ("task.vehicels", 3, "unknown key task.vehicels: .*Scenario takes task, vehicles"),
+        ("loss.cost_limits", 3, "unknown key loss.cost_limits"),
+        ("projector.step_size", "0.02 rad", "projector.step_size must be a number, got '0.02 rad'"),
+        ("task.reward.weights", [1, "x"], "task.reward.weights must be a list, each a number"),
+        ("task.standstill", "never", "task.standstill must be a number or null, got 'never'"),
+        ("encoder.policy._target_", "saferl.Nothing", "'saferl.Nothing'"),
+    ):
+        cfg = compose()
+        OmegaConf.set_struct(cfg, False)
+        OmegaConf.update(cfg, key, value)
+        with pytest.raises(ValueError, match=message):
+            check_training(cfg)
+
+
+def test_kinds():
+    assert fits(1, float) and fits(1.5, float) and not fits(1.5, int) and not fits(True, float)
+    assert (
+        fits(None, float | None) and not fits("x", float | None) and fits([1, 2], tuple[float, ...])
+    )
+    assert "num_envs" in arguments("saferl.envs.intersection.HighwayIntersection")
