@@ -33,7 +33,9 @@ def physics(ego: torch.Tensor, vehicles: torch.Tensor, action: torch.Tensor) -> 
     """Mean Algorithm 2 cost, and share that leaves the road within 1 s under a held action."""
     state, control = ego[:, 1:7], to_physical(action)
     cos, sin = torch.cos(state[:, 4]), torch.sin(state[:, 4])
-    own = torch.stack([state[:, 2] * cos - state[:, 3] * sin, state[:, 2] * sin + state[:, 3] * cos], -1)
+    own = torch.stack(
+        [state[:, 2] * cos - state[:, 3] * sin, state[:, 2] * sin + state[:, 3] * cos], -1
+    )
     velocity = vehicles[..., 3:5] + own[:, None]
     phi = vehicles[..., 5]
     speed = velocity[..., 0] * torch.cos(phi) + velocity[..., 1] * torch.sin(phi)
@@ -68,7 +70,9 @@ def main() -> None:
         data = agent.actor(data)
         risk = agent.loss.cost_value(data.copy())["state_action_cost_value"].squeeze(-1)
     risky = data[risk > cfg.cost_limit]
-    print(f"{len(risky)} of {len(data)} states are risky (Q_c > {cfg.cost_limit}) under the mean action.")
+    print(
+        f"{len(risky)} of {len(data)} states are risky (Q_c > {cfg.cost_limit}) under the mean action."
+    )
     if not len(risky):
         return
     scene = TensorDict({key: risky[key] for key in ("ego", "vehicles", "action")}, risky.batch_size)

@@ -93,12 +93,17 @@ def main() -> None:
     torch.set_num_threads(1)
     for scale in args.scale:
         for reading in ("normalised", "raw"):
-            print(f"\n{reading}, destination_scale={scale:g}\n{'':<30}" + "".join(f"{t:>9}" for t in TASKS))
+            print(
+                f"\n{reading}, destination_scale={scale:g}\n{'':<30}"
+                + "".join(f"{t:>9}" for t in TASKS)
+            )
             reward = Reward(reading=reading, destination_scale=scale)
             for name in drivers():
                 values = [
                     discounted(
-                        Scenario(task=task, vehicles=0, rows=1, reward=reward), drivers()[name], args.episodes
+                        Scenario(task=task, vehicles=0, rows=1, reward=reward),
+                        drivers()[name],
+                        args.episodes,
                     )[0]
                     for task in TASKS
                 ]

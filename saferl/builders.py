@@ -62,7 +62,7 @@ def build_env(
 ) -> EnvBase:
     """The configured backend with a scenario; transforms from the inside outwards."""
     env = make(cfg.env, scenario=scenario, num_envs=num_envs, seed=seed, device=device_of(cfg))
-    return TransformedEnv(env, Compose(*transforms)) if transforms else env
+    return TransformedEnv(env, Compose(*transforms)) if transforms else env  # pyright: ignore
 
 
 @dataclass

@@ -62,8 +62,7 @@ class CollectorState:
         collector = self.collector
         self._base_env.load_state_dict(state["env"])
         if "transform" in state:
-            transform: torch.nn.Module = collector.env.transform
-            transform.load_state_dict(state["transform"])
+            collector.env.transform.load_state_dict(state["transform"])  # pyright: ignore
         collector._carrier = TensorDict.from_dict(
             state["carrier"], batch_size=collector.env.batch_size, device=collector.env.device
         )
@@ -108,7 +107,7 @@ class BufferState:
         buffer.empty()
         if count:
             rows = TensorDict.from_dict(state["rows"], batch_size=[count])
-            buffer.storage.set(range(count), rows)
+            buffer.storage.set(range(count), rows)  # pyright: ignore[reportArgumentType]
         buffer.writer.load_state_dict(state["writer"])
         buffer.sampler.load_state_dict(state["sampler"])
         if state["generator"] is not None:

@@ -56,7 +56,7 @@ def train(cfg: DictConfig) -> None:
     trainer.train()
 
     settings = cfg.evaluation
-    test(
+    measure(
         cfg,
         as_test(hydra.utils.instantiate(cfg.task), settings.policy_frequency),
         *trained_policy(cfg, run),
@@ -76,7 +76,7 @@ def evaluate(cfg: DictConfig) -> None:
     scenario = hydra.utils.instantiate(cfg.task)
     policy, transforms, name = choose_policy(cfg)
     out = Path(HydraConfig.get().runtime.output_dir)
-    rows = test(
+    rows = measure(
         cfg,
         scenario,
         policy,
@@ -163,7 +163,7 @@ def choose_policy(cfg: DictConfig) -> tuple[TensorDictModuleBase, list[Transform
     return policy, transforms if cfg.project else [], f"{trained.algo_name} ({name})"
 
 
-def test(
+def measure(
     cfg: DictConfig,
     scenario: Scenario,
     policy: TensorDictModuleBase,

@@ -51,7 +51,7 @@ def restored(run: Path, *overrides: str) -> Trainer:
 def test_killed_and_resumed_equals_uninterrupted(algo: str, tmp_path: Path, spawn):
     """SIGKILL in mid-episode on highway-env with traffic, a projector at work in ``arsac``."""
     options = [*SMALL, *TRAFFIC, f"algo={algo}", "frames=48", "save_every=4"]
-    options += ["projector.steps=8", "cost_limit=0"] if algo == "arsac" else []
+    options += ["projector.steps=7", "projector.limit=-1"] if algo == "arsac" else []
     killed = spawn("saferl", *options, "out=killed")
     # Half of the run or so: where exactly it dies must not matter.
     while not list((tmp_path / "killed/checkpoints").glob("checkpoint-*0[23]?")):

@@ -86,7 +86,7 @@ def test_an_update_moves_everything_that_learns(tmp_path: Path):
     loss = trainer.learner.loss
     before = {name: value.clone() for name, value in loss.state_dict().items() if _tensor(value)}
     trainer.learner.schedule(0.0)
-    trainer.learner.update(trainer.buffer.sample())
+    trainer.learner.update(costly(trainer))
     after = loss.state_dict()
     for kind in ("actor_network", "qvalue_network", "cost_critic"):
         names = [name for name in before if name.startswith(f"{kind}_params")]
@@ -101,6 +101,12 @@ def test_an_update_moves_everything_that_learns(tmp_path: Path):
     assert {parameter.data_ptr() for parameter in trainer.collector.policy.parameters()} <= learned
 
 
+def costly(trainer: Trainer) -> TensorDict:
+    """A batch with a cost, of which an empty road has none."""
+    batch = trainer.buffer.sample()
+    return batch.set(("next", "cost"), torch.rand(batch["next", "cost"].shape))
+
+
 def _tensor(value) -> bool:
     return isinstance(value, torch.Tensor)
 
@@ -109,7 +115,7 @@ def test_projector_reads_the_live_critics(tmp_path: Path):
     trainer = trainer_of(tmp_path, "algo=rsac")
     collect(trainer, 3)
     projector = trainer.collector.env.transform[-1]
-    batch = trainer.buffer.sample()
+    batch = costly(trainer)
     before = projector.risk(batch.copy())["state_action_cost_value"].clone()
     trainer.learner.update(batch)
     assert not torch.equal(before, projector.risk(batch.copy())["state_action_cost_value"])

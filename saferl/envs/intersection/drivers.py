@@ -38,11 +38,9 @@ class Driver(TensorDictModuleBase):
     True
     """
 
-    in_keys = ["ego", "vehicles", "route"]
-    out_keys = ["action"]
-
     def __init__(self, speed: float = CRUISE):
         super().__init__()
+        self.in_keys, self.out_keys = ["ego", "vehicles", "route"], ["action"]
         self.speed = speed
 
     def target_speed(self, ego: Tensor, vehicles: Tensor, line: Tensor, s: Tensor) -> Tensor:
