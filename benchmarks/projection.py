@@ -61,7 +61,7 @@ def main() -> None:
     torch.manual_seed(0)
     cfg = run_config(args.run)
     cfg.device = "cpu"
-    agent = load_agent(cfg, args.run)
+    agent = load_agent(cfg, args.run, "run")
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(cfg.buffer_size))
     load_component(latest(args.run), buffer, "buffer")
     index = torch.randperm(len(buffer))[: args.samples]
