@@ -17,11 +17,12 @@ from pathlib import Path
 
 import torch
 from tensordict import TensorDict
+from torchrl.checkpoint import Checkpoint
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from saferl.builders import load_agent
-from saferl.checkpoint import latest, load_component
+from saferl.checkpoint import BufferState, latest
 from saferl.commands import run_config
 from saferl.envs.intersection import CollisionCost
 from saferl.envs.intersection.dynamics import step_ego, to_physical
@@ -62,8 +63,10 @@ def main() -> None:
     cfg = run_config(args.run)
     cfg.device = "cpu"
     agent = load_agent(cfg, args.run, "run")
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(cfg.buffer_size))
-    load_component(latest(args.run), buffer, "buffer")
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(cfg.buffer_size), generator=torch.Generator()
+    )
+    Checkpoint(buffer=BufferState(buffer)).load(latest(args.run))
     index = torch.randperm(len(buffer))[: args.samples]
     data = buffer[index].select("ego", "vehicles")
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):

@@ -60,10 +60,12 @@ def launch(command: str, config: str) -> None:
 
 
 def _drop_if_empty(folder: Path) -> None:
-    """Hydra makes the output folder before anything can be checked."""
-    if folder != Path.cwd():
-        with suppress(OSError):
+    """Undo the output folder, which Hydra makes before anything can be checked."""
+    here = Path.cwd()
+    with suppress(OSError):  # it is not empty, or not there
+        while folder != here:
             folder.rmdir()
+            folder = folder.parent if folder.is_relative_to(here) else here
 
 
 def explain(error: Exception, config: str = "config", arguments: list[str] | None = None) -> str:

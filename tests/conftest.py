@@ -1,4 +1,4 @@
-"""Small runs, in this process and in others."""
+"""Commands run in this process and in others."""
 
 from __future__ import annotations
 
@@ -7,37 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-import hydra
 import pytest
 import torch
-from omegaconf import DictConfig
 
 from saferl.cli import launch
-from saferl.paths import config_dir
 
 torch.set_num_threads(1)
-
-#: Turns any training into one of seconds.
-SMALL = (
-    "episodes=null",
-    "frames=24",
-    "warmup_frames=8",
-    "batch_size=8",
-    "buffer_size=64",
-    "updates_per_frame=0.5",
-    "record_every=8",
-    "encoder.policy.width=16",
-    "evaluation.episodes=1",
-    "logger=none",
-    "device=cpu",
-)
-EMPTY = ("env=batched", "env.num_envs=2", "task.vehicles=0")
-
-
-def compose(*overrides: str, config: str = "config") -> DictConfig:
-    """The configuration that a command line describes."""
-    with hydra.initialize_config_dir(config_dir(), version_base="1.3"):
-        return hydra.compose(config, list(overrides))
 
 
 @pytest.fixture

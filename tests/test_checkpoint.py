@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import EMPTY, SMALL, compose
 from omegaconf import OmegaConf
+from small import EMPTY, SMALL, compose
 from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import hydra
 import pytest
-from conftest import EMPTY, SMALL, compose
 from omegaconf import OmegaConf
+from small import EMPTY, SMALL, compose
 
 from saferl.builders import build_trainer
 from saferl.checkpoint import CONFIG
@@ -87,7 +87,7 @@ def test_mistake_is_one_line_and_leaves_nothing(
 ):
     line = refusal(*command_name, *arguments.split())
     assert message in line
-    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert not list(tmp_path.iterdir())
 
 
 def test_missing_logger_is_named(refusal, monkeypatch):

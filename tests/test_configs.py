@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from conftest import SMALL, compose
 from omegaconf import OmegaConf
+from small import SMALL, compose
 
 from saferl.builders import build_agent, build_trainer
 from saferl.modules import MLPPolicyEncoder, MMAMPolicyEncoder

@@ -34,7 +34,8 @@ class Driver(TensorDictModuleBase):
 
     >>> from saferl.envs.intersection import BatchedIntersection, Scenario
     >>> env = BatchedIntersection(Scenario(task="lt", vehicles=0), num_envs=4)
-    >>> bool(env.rollout(125, Driver())["next", "success"][:, -1].all())
+    >>> data = env.rollout(125, Driver(), break_when_any_done=False)
+    >>> bool(data["next", "success"].any(1).all())
     True
     """
 
