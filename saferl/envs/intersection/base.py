@@ -1,3 +1,5 @@
+# TorchRL's specs take tuples that their annotations do not name.
+# pyright: reportArgumentType=false
 """What both backends of the intersection share: settings, specs, seeds."""
 
 from __future__ import annotations

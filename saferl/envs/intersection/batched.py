@@ -138,8 +138,8 @@ class BatchedIntersection(IntersectionBase):
         )
 
     def snapshot(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        states = self._state["ego"][index], self._vehicles[index][self._present[index]]
-        return tuple(state.double().cpu().numpy() for state in states)
+        others = self._vehicles[index][self._present[index]]
+        return self._state["ego"][index].double().cpu().numpy(), others.double().cpu().numpy()
 
     def state_dict(self, *args, **kwargs) -> dict[str, Tensor]:
         """Everything that decides what comes next: vehicle states and episode sequences."""

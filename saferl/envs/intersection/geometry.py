@@ -93,7 +93,8 @@ _EXITS = torch.tensor([[-1.0, 0.0], [0.0, -1.0], [0.0, -1.0], [1.0, 0.0]], dtype
 
 @lru_cache(maxsize=32)
 def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    return tuple(t.to(device=device, dtype=dtype) for t in (_LINES, _TARGETS, _EXITS))
+    lines, targets, exits = (t.to(device=device, dtype=dtype) for t in (_LINES, _TARGETS, _EXITS))
+    return lines, targets, exits
 
 
 def wrap(angle: Tensor) -> Tensor:
