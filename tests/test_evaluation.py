@@ -19,7 +19,7 @@ from saferl.envs.intersection import (
     Reward,
     Scenario,
 )
-from saferl.envs.intersection.base import episode_seeds
+from saferl.envs.intersection.spawning import episode_seeds
 from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver
 from saferl.envs.transforms import SafetyProjector
 from saferl.evaluation import as_test, evaluate, write

@@ -134,8 +134,10 @@ class MMAMPolicyEncoder(nn.Module):
 
     The EV and the SVs are embedded apart (linear + GELU) into Z_1; multi-head self-attention over
     all rows is added to Z_1; the EV's row of that sum is then the only query of a multi-head
-    ego-attention over the sum (keys and values from there: ours). The operator T and the W_i of
-    AttnE1 are two linear maps in a row, hence one matrix here.
+    ego-attention over the sum (keys and values from there: ours), which is added to that row and
+    passed through ``depth`` layers (ours: without them an empty road would leave a policy with one
+    hidden layer). The operator T and the W_i of AttnE1 are two linear maps in a row, hence one matrix
+    here. All activations are GELU.
 
     Absent rows (I_veh = 0) are zeroed and get -1e9 before the softmax, so neither the order of the
     SVs nor the number of absent rows matters, and any number of rows works, none included.
@@ -145,6 +147,7 @@ class MMAMPolicyEncoder(nn.Module):
         heads: h, a divisor of ``width``.
         scale: logits are divided by sqrt(d) (``"paper"``, as printed) or sqrt(d / h)
             (``"per_head"``, the usual one).
+        depth: layers of ``width`` units after the attention (ours).
         ego_scale: divisors of the ego features; their number is the size of ``ego``.
         vehicle_scale: divisors of a vehicle's features; I_veh comes first.
 
@@ -167,6 +170,7 @@ class MMAMPolicyEncoder(nn.Module):
         width: int = 256,
         heads: int = 4,
         scale: str = "paper",
+        depth: int = 2,
         ego_scale: Sequence[float] = EGO_SCALE,
         vehicle_scale: Sequence[float] = VEHICLE_SCALE,
     ):
@@ -174,11 +178,16 @@ class MMAMPolicyEncoder(nn.Module):
         self.tokens = _SceneTokens(width, ego_scale, vehicle_scale)
         self.self_attention = _SelfAttention(width, heads, scale)
         self.ego_attention = _EgoAttention(width, heads, scale)
+        self.layers = nn.ModuleList(_Linear(width, width) for _ in range(depth))
 
     def forward(self, ego: Tensor, vehicles: Tensor) -> Tensor:
         tokens, present = self.tokens(ego, vehicles)
         tokens = tokens + self.self_attention(tokens, present)
-        return self.ego_attention(tokens[..., 0, :], tokens, present)
+        row = tokens[..., 0, :]
+        row = row + self.ego_attention(row, tokens, present)
+        for layer in self.layers:
+            row = F.gelu(layer(row))
+        return row
 
 
 class MMAMValue(nn.Module):
@@ -187,14 +196,15 @@ class MMAMValue(nn.Module):
     Q(s, a) = Y_attn . W_attn + Y_mlp . W_mlp over the N + 2 tokens of Z_2 (EV, SVs, action). Y_attn
     is one hop of multi-head ego-attention. Y_mlp is permutation-invariant (ours): a layer of
     ``pair_width`` units sees each SV together with the EV and the action, its mean over the SVs
-    that are present joins the tokens of EV and action in a layer of ``width`` units. All
-    activations are GELU.
+    that are present joins the tokens of EV and action in the first of ``depth`` layers of ``width``
+    units. All activations are GELU.
 
     Args:
         width: d, the size of a token and of both branches.
         heads: h, a divisor of ``width``.
         scale: ``"paper"`` or ``"per_head"``, see :class:`MMAMPolicyEncoder`.
         action_dim: size of the action.
+        depth: layers of ``width`` units in the MLP branch, at least one (ours).
         pair_width: units of the layer applied to each SV (ours); ``None`` is ``width // 4``.
         ego_scale: divisors of the ego features.
         vehicle_scale: divisors of a vehicle's features; I_veh comes first.
@@ -223,17 +233,21 @@ class MMAMValue(nn.Module):
         heads: int = 4,
         scale: str = "paper",
         action_dim: int = 2,
+        depth: int = 2,
         pair_width: int | None = None,
         ego_scale: Sequence[float] = EGO_SCALE,
         vehicle_scale: Sequence[float] = VEHICLE_SCALE,
     ):
         super().__init__()
+        if depth < 1:
+            raise ValueError(f"depth must be >= 1, got {depth}.")
         pair_width = width // 4 if pair_width is None else pair_width
         self.tokens = _SceneTokens(width, ego_scale, vehicle_scale)
         self.action = _Linear(action_dim, width)
         self.attention = _EgoAttention(width, heads, scale)
         self.pair = _Linear(3 * width, pair_width)  # on (SV, EV, action)
         self.joint = _Linear(2 * width + pair_width, width)  # on (EV, action, pooled pairs)
+        self.layers = nn.ModuleList(_Linear(width, width) for _ in range(depth - 1))
         self.w_attn = _Linear(width, 1, bias=False)
         self.w_mlp = _Linear(width, 1, bias=False)
 
@@ -261,6 +275,7 @@ class MMAMValue(nn.Module):
         joint_scene = _linear(ego_token, on_ego, self.joint.bias)
         share = present[..., 1:, None].to(tokens.dtype)
         share = share / share.sum(-2, keepdim=True).clamp(min=1.0)
+        layers = [(layer.weight, layer.bias) for layer in self.layers]
         action_weight, action_bias, w_mlp = self.action.weight, self.action.bias, self.w_mlp.weight
 
         def value(action: Tensor) -> Tensor:
@@ -272,6 +287,8 @@ class MMAMValue(nn.Module):
             pairs = F.gelu(pair_scene + _linear(token, pair_on_action).unsqueeze(-2))
             pooled = (pairs * share).sum(-2)
             y_mlp = joint_scene + _linear(token, joint_on_action) + _linear(pooled, joint_on_pairs)
+            for weight, bias in layers:
+                y_mlp = _linear(F.gelu(y_mlp), weight, bias)
             return y_attn.unsqueeze(-1) + _linear(F.gelu(y_mlp), w_mlp)
 
         return value

@@ -10,9 +10,15 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from saferl.envs.intersection import BatchedIntersection, Scenario
-from saferl.envs.intersection.base import OUTCOMES, episode_seeds, mix, uniform
-from saferl.envs.intersection.batched import draw_route, draw_start
+from saferl.envs.intersection.base import OUTCOMES
 from saferl.envs.intersection.geometry import ROUTES, ROUTES_OF_TASK, project, reference_lines
+from saferl.envs.intersection.spawning import (
+    draw_route,
+    draw_start,
+    episode_seeds,
+    mix,
+    uniform,
+)
 
 NORTH = -math.pi / 2
 OBSERVATION = ("ego", "vehicles", "route", *OUTCOMES)
@@ -75,11 +81,6 @@ def test_rows_are_a_setting():
     env = make(2, rows=4)
     check_env_specs(env, seed=0)
     assert env.reset()["vehicles"].shape == (2, 4, 6)
-
-
-def test_traffic_is_refused():
-    with pytest.raises(ValueError, match=r"vehicles must be 0, got 10\. Use env=highway"):
-        BatchedIntersection(Scenario(vehicles=10))
 
 
 @pytest.mark.parametrize(

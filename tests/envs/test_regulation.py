@@ -20,7 +20,8 @@ from saferl.envs.intersection.geometry import (
 )
 from saferl.envs.intersection.network import build_network, rectangles_overlap, routes
 from saferl.envs.intersection.regulation import IntersectionRoad
-from saferl.envs.intersection.traffic import EgoVehicle, draw_traffic
+from saferl.envs.intersection.spawning import Drawn, Traffic, draw_traffic, episode_seeds
+from saferl.envs.intersection.vehicles import EgoVehicle
 
 DT = 1 / 15
 SOUTH, WEST, NORTH, EAST = 0, 4, 8, 12  # first route of each arm
@@ -36,8 +37,10 @@ def make_road(*vehicles: tuple[int, float, float], ego: tuple | None = None) -> 
         x, y, phi = road.table.pose(route, np.float64(s))
         state = torch.tensor([x, y, speed, 0.0, phi, 0.0], dtype=torch.float64)
         car = EgoVehicle(road, state, route)
-    route, s, speed = (np.array(column) for column in zip(*vehicles, strict=True))
-    road.populate(car, route, s, speed)
+    route, s, speed = (torch.tensor(column) for column in zip(*vehicles, strict=True))
+    s, speed = s.double(), speed.double()
+    yes = torch.ones(len(route), dtype=torch.bool)
+    road.populate(car, Drawn(yes, route, s, speed, torch.full_like(s, 1.2), ~yes))
     return road
 
 
@@ -250,18 +253,24 @@ def test_vehicles_leave_at_the_end_of_their_exit_arm():
 
 
 def test_spawning_keeps_its_distances_and_ranges():
-    road, counts = IntersectionRoad(), []
-    for seed in range(200):
-        ego_route = seed % 4
-        x, y, phi = road.table.pose(ego_route, np.float64(60.0))
-        ego = EgoVehicle(road, torch.tensor([x, y, 8.0, 0, phi, 0]), ego_route)
-        route, s, speed = draw_traffic(np.random.default_rng(seed), road.table, 10, ego)
-        counts.append(len(route))
-        place = road.table.pose(route, s)[:, :2]
-        gap = np.linalg.norm(place[:, None] - place, axis=-1) + 1e9 * np.eye(len(route))
-        assert gap.min() >= 15.0
-        assert np.linalg.norm(place - ego.position, axis=-1).min() >= 20.0
-        assert ((s >= 0) & (s <= 95)).all()
-        assert ((speed >= 6) & (speed <= 10)).all()
-    assert max(counts) <= 10
-    assert np.mean(counts) > 5
+    seeds = episode_seeds(1, 200)
+    routes_of_ego = torch.arange(200) % 4
+    table = routes()
+    pose = torch.from_numpy(table.pose(routes_of_ego.numpy(), np.full(200, 60.0)))
+    ego = torch.zeros(200, 6, dtype=torch.float64)
+    ego[:, :2] = pose[:, :2]
+    drawn = draw_traffic(Traffic(), routes_of_ego, ego, seeds)
+    for k in range(200):
+        there = drawn.present[k]
+        place = torch.from_numpy(table.pose(drawn.route[k].numpy(), drawn.s[k].numpy())[:, :2])
+        apart = torch.cdist(place[there], place[there]) + 1e9 * torch.eye(int(there.sum()))
+        assert apart.min() >= 15.0
+        assert (place[there] - ego[k, :2]).norm(dim=-1).min() >= 20.0
+        # None was removed without a reason: too close to the ego or to an earlier one that stayed.
+        for gone in (~there).nonzero().flatten().tolist():
+            kept = torch.cat([place[:gone][there[:gone]], place[:0]])
+            to_ego = (place[gone] - ego[k, :2]).norm()
+            assert to_ego < 20.0 or (kept - place[gone]).norm(dim=-1).min() < 15.0
+    assert ((drawn.s >= 0) & (drawn.s <= 95)).all()
+    assert ((drawn.speed >= 6) & (drawn.speed <= 10)).all()
+    assert 5 < drawn.present.sum(1).double().mean() < 10

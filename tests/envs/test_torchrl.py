@@ -11,8 +11,8 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from saferl.envs.intersection import BatchedIntersection, HighwayIntersection, Reward, Scenario
-from saferl.envs.intersection.base import OUTCOMES, episode_seeds
-from saferl.envs.intersection.batched import draw_route
+from saferl.envs.intersection.base import OUTCOMES
+from saferl.envs.intersection.spawning import draw_route, episode_seeds
 from saferl.envs.intersection.drivers import Driver
 
 OBSERVATION = ("ego", "vehicles", "route", *OUTCOMES)

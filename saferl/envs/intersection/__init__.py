@@ -6,8 +6,10 @@ from saferl.envs.intersection.cost import CollisionCost
 from saferl.envs.intersection.highway import IntersectionEnv, register
 from saferl.envs.intersection.highway_torchrl import HighwayIntersection
 from saferl.envs.intersection.reward import Reward
+from saferl.envs.intersection.spawning import SCENARIOS, Traffic
 
 __all__ = [
+    "SCENARIOS",
     "BatchedIntersection",
     "CollisionCost",
     "HighwayIntersection",
@@ -15,5 +17,6 @@ __all__ = [
     "IntersectionEnv",
     "Reward",
     "Scenario",
+    "Traffic",
     "register",
 ]

@@ -4,7 +4,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,10 +20,35 @@ from saferl.envs.intersection.cost import CollisionCost
 from saferl.envs.intersection.geometry import ROUTES, ROUTES_OF_TASK
 from saferl.envs.intersection.observation import ROWS
 from saferl.envs.intersection.reward import Reward
+from saferl.envs.intersection.spawning import SCENARIOS, U31, Traffic, mix
+from saferl.envs.intersection.traffic import PERIOD
 
 SUBSTEPS = 3
 STANDING = 0.3  # m/s, slower counts as standing still
 OUTCOMES = ("collision", "offroad", "success")
+
+
+def build(name: str, default: Any, value: Any) -> Any:
+    """Settings from a dataclass ``default`` and the mapping of what differs.
+
+    Raises:
+        ValueError: an unknown key, with those that there are; what the dataclass refuses.
+
+    >>> build("reward", Reward(), {"raeding": "raw"})
+    Traceback (most recent call last):
+    ...
+    ValueError: reward.raeding is unknown; choose from reading, risk_shaping, collision, arrival, \
+speed, destination_scale, weights, energy, smoothness.
+    """
+    if isinstance(value, type(default)):
+        return value
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{name} must be a {type(default).__name__} or a mapping, got {value!r}.")
+    known = [field.name for field in dataclasses.fields(default)]
+    for key in value:
+        if key not in known:
+            raise ValueError(f"{name}.{key} is unknown; choose from {', '.join(known)}.")
+    return dataclasses.replace(default, **value)
 
 
 @dataclass(frozen=True)
@@ -29,8 +57,10 @@ class Scenario:
 
     Attributes:
         task: ``lt``, ``gs``, ``rt``, or ``mixed`` (one drawn at each reset).
-        vehicles: surrounding vehicles drawn at reset.
+        vehicles: surrounding vehicles drawn at reset; None: as many as the scenario says.
         rows: M, rows of the ``vehicles`` observation; one is always padding.
+        scenario: the traffic: a name in :data:`SCENARIOS`.
+        traffic: settings of :class:`Traffic` that differ from the scenario's.
         policy_frequency: decisions per second; each is integrated in 3 substeps.
         duration: seconds until ``truncated``.
         route_starts: fraction of the starts drawn uniformly along the route instead of 40 m before
@@ -47,7 +77,9 @@ class Scenario:
     """
 
     task: str = "mixed"
-    vehicles: int = 10
+    vehicles: int | None = None
+    scenario: str = "nominal"
+    traffic: Traffic | Mapping[str, Any] = field(default_factory=dict)
     rows: int = ROWS
     policy_frequency: int = 5
     duration: float = 25.0
@@ -59,7 +91,7 @@ class Scenario:
     def __post_init__(self):
         if self.task not in ROUTES_OF_TASK:
             raise ValueError(f"task must be one of {', '.join(ROUTES_OF_TASK)}, got {self.task!r}.")
-        if self.vehicles < 0:
+        if self.vehicles is not None and self.vehicles < 0:
             raise ValueError(f"vehicles must be >= 0, got {self.vehicles}.")
         if self.rows < 1:
             raise ValueError(f"rows must be >= 1, got {self.rows}.")
@@ -70,8 +102,21 @@ class Scenario:
         if not 0.0 <= self.route_starts <= 1.0:
             raise ValueError(f"route_starts must be in [0, 1], got {self.route_starts}.")
 
+        if self.scenario not in SCENARIOS:
+            raise ValueError(
+                f"scenario must be one of {', '.join(SCENARIOS)}, got {self.scenario!r}."
+            )
+        traffic = build("traffic", SCENARIOS[self.scenario], self.traffic)
+        if self.vehicles is not None:
+            traffic = dataclasses.replace(traffic, vehicles=(self.vehicles, self.vehicles))
+        object.__setattr__(self, "traffic", traffic)
         if self.standstill is not None and self.standstill <= 0:
             raise ValueError(f"standstill must be null or > 0 seconds, got {self.standstill}.")
+
+    @property
+    def rules_every(self) -> int:
+        """Decisions of the ego between two of the traffic."""
+        return max(1, round(PERIOD * self.policy_frequency))
 
     @property
     def patience(self) -> float:
@@ -87,35 +132,6 @@ class Scenario:
     def dt(self) -> float:
         """Length of a substep, seconds."""
         return 1.0 / (SUBSTEPS * self.policy_frequency)
-
-
-_MIX = (-7046029254386353131, -4658895280553007687, -7723592293110705685)
-_U31 = 0x7FFFFFFF
-
-
-def _shift(x: Tensor, bits: int) -> Tensor:
-    return (x >> bits) & ((1 << (64 - bits)) - 1)
-
-
-def mix(seed: Tensor, stream: int | Tensor) -> Tensor:
-    """Hash int64 seeds [...] and a stream number into new int64 seeds (SplitMix64's finaliser).
-
-    A draw is a function of its seed alone, so an episode does not feel its neighbours.
-    """
-    x = seed + torch.as_tensor(stream + 1, device=seed.device) * _MIX[0]
-    x = (x ^ _shift(x, 30)) * _MIX[1]
-    x = (x ^ _shift(x, 27)) * _MIX[2]
-    return x ^ _shift(x, 31)
-
-
-def uniform(seed: Tensor, stream: int) -> Tensor:
-    """A number in [0, 1), float64 [...], from int64 seeds [...] and a stream number."""
-    return _shift(mix(seed, stream), 11).to(torch.float64) * 2.0**-53
-
-
-def episode_seeds(seed: int, count: int) -> Tensor:
-    """Seeds [count] of the episodes of a test with this seed."""
-    return mix(torch.arange(count, dtype=torch.int64), seed) & _U31
 
 
 class IntersectionBase(EnvBase):
@@ -165,7 +181,7 @@ class IntersectionBase(EnvBase):
         given = None if tensordict is None else tensordict.get("seed", None)
         if given is not None:
             return given.reshape(self.batch_size).to(torch.int64)
-        seeds = mix(self._stream, self._episode) & _U31
+        seeds = mix(self._stream, self._episode) & U31
         self._episode = self._episode + reset
         return seeds
 

@@ -2,144 +2,268 @@
 
 from __future__ import annotations
 
+import logging
+import warnings
+from functools import partial
+
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from saferl.envs.intersection.base import STANDING, SUBSTEPS, IntersectionBase, Scenario, uniform
+from saferl.envs.intersection.base import STANDING, SUBSTEPS, IntersectionBase, Scenario
 from saferl.envs.intersection.dynamics import step_ego, to_physical
-from saferl.envs.intersection.geometry import (
-    ARM,
-    EXIT_DISTANCE,
-    ROUTES_OF_TASK,
-    arrived,
-    line_pose,
-    offroad,
-    reference_lines,
-)
+from saferl.envs.intersection.geometry import arrived, frame, frames_overlap, offroad
 from saferl.envs.intersection.observation import observe
+from saferl.envs.intersection.roads import Lanes, lane_frames, lanes, zones
+from saferl.envs.intersection.spawning import (
+    Drawn,
+    draw_route,
+    draw_start,
+    draw_traffic,
+    enter,
+    sense,
+)
+from saferl.envs.intersection.traffic import Vehicles, accelerate, move, road_rules, vehicle_states
+
+log = logging.getLogger(__name__)
+
+State = dict[str, Tensor]
+_VEHICLE, _LANE, _OWN = "vehicle_", "lane_", "own_"
 
 
-def draw_route(task: str, seed: Tensor) -> Tensor:
-    """Routes [...] int64 of a task; ``mixed`` draws the task first, then its lane."""
-    tasks = [ROUTES_OF_TASK[name] for name in (("lt", "gs", "rt") if task == "mixed" else (task,))]
-    table = torch.tensor([[lanes[0], lanes[-1]] for lanes in tasks], device=seed.device)
-    row = (uniform(seed, 0) * len(tasks)).long()
-    return table[row, (uniform(seed, 1) * 2).long()]
+def vehicles_of(state: State) -> Vehicles:
+    """The surrounding vehicles in a state of the batched intersection, each [N, B]."""
+    return Vehicles(*(state[_VEHICLE + name].movedim(-1, 0) for name in Vehicles._fields))
 
 
-def draw_start(route: Tensor, seed: Tensor, route_starts: float) -> Tensor:
-    """Start states [..., 6] float64: 40 +- 5 m before the box at U[6, 10] m/s, or, for the share
-    ``route_starts`` of the seeds, anywhere between there and the goal."""
-    anywhere = uniform(seed, 2) < route_starts
-    before = ARM - 40.0 + 10.0 * (uniform(seed, 3) - 0.5)
-    lines = reference_lines(route, before)[..., 0, :, :]
-    past = lines[..., 3, 5] + EXIT_DISTANCE
-    first = ARM - 45.0
-    s = torch.where(anywhere, first + (past - first) * uniform(seed, 3), before)
-    x, y, phi = line_pose(lines, s).unbind(-1)
-    speed = 6.0 + 4.0 * uniform(seed, 4)
-    zero = torch.zeros_like(x)
-    return torch.stack([x, y, speed, zero, phi, zero], -1)
+def _named(prefix: str, values: Vehicles | Lanes) -> State:
+    return {prefix + name: value.movedim(0, -1) for name, value in values._asdict().items()}
+
+
+def scenes_last(state: State) -> State:
+    """The same tensors [B, ...], laid out so that the scenes are side by side in memory."""
+    return {k: v.movedim(0, -1).contiguous().movedim(-1, 0) for k, v in state.items()}
+
+
+def _lanes(state: State, whose: str) -> Lanes:
+    return Lanes(*(state[whose + name].movedim(-1, 0) for name in Lanes._fields))
+
+
+def _roads(vehicles: Vehicles, ego_route: Tensor) -> State:
+    """What follows from the routes [N, B] and [B] alone, looked up once an episode."""
+    route, like = vehicles.route, vehicles.s
+    begin, end = zones(route, torch.cat([route, ego_route[None]]), like)
+    return {
+        **_named(_LANE, lanes(route, like)),
+        **_named(_OWN, lanes(ego_route, like)),
+        "zone_begin": begin.movedim(-1, 0),
+        "zone_end": end.movedim(-1, 0),
+    }
+
+
+def _choose(mask: Tensor, yes: Vehicles, no: Vehicles) -> Vehicles:
+    return Vehicles(*(torch.where(mask, a, b) for a, b in zip(yes, no, strict=True)))
+
+
+def _drivers(drawn: Drawn) -> Vehicles:
+    """Vehicles [N, B] that have just been drawn, [B, N]."""
+    present, route, s, speed, headway, heedless = (v.movedim(-1, 0) for v in drawn)
+    s, speed, headway = s.float(), speed.float(), headway.float()
+    never = torch.full_like(s, torch.inf)
+    return Vehicles(
+        present, route, s, speed, speed, headway, heedless,
+        entered=torch.full((len(s) + 1, *s.shape[1:]), torch.inf, device=s.device),
+        held=torch.zeros_like(present), stop=never,
+    )  # fmt: skip
+
+
+def begin(scenario: Scenario, seed: Tensor) -> State:
+    """The first states of the episodes with seeds [B] int64, each tensor [B, ...]."""
+    route = draw_route(scenario.task, seed)
+    ego = draw_start(route, seed, scenario.route_starts)
+    vehicles = _drivers(draw_traffic(scenario.traffic, route, ego, seed))
+    return {
+        "seed": seed, "route": route, "ego": ego.float(),
+        "steps": torch.zeros_like(seed), "still": torch.zeros_like(seed),
+        "control": torch.zeros(len(seed), 2, device=seed.device),
+        "observed": torch.zeros_like(vehicles.present).movedim(-1, 0),
+        **_named(_VEHICLE, vehicles), **_roads(vehicles, route),
+    }  # fmt: skip
+
+
+def restart(scenario: Scenario, state: State, seed: Tensor, reset: Tensor) -> tuple[State, State]:
+    """Begin new episodes where ``reset`` [B]; returns all states, and what is observed in them."""
+    state = scenes_last(
+        {
+            key: torch.where(reset.reshape(-1, *[1] * (value.ndim - 1)), value, state[key])
+            for key, value in begin(scenario, seed).items()
+        }
+    )
+    observation, _, observed = look(scenario, state)
+    return state | {"observed": observed}, observation
+
+
+def _respawn(scenario: Scenario, vehicles: Vehicles, state: State) -> Vehicles:
+    present, route, s = (v.movedim(0, -1) for v in (vehicles.present, vehicles.route, vehicles.s))
+    fresh = enter(
+        scenario.traffic, state["route"], state["seed"], state["steps"], present, route, s
+    )
+    new = _drivers(fresh)
+    joins = new.present
+    never = torch.zeros_like(joins[:1])  # the ego
+    merged = (
+        torch.where(torch.cat([joins, never]) if name == "entered" else joins, ours, old)
+        for name, ours, old in zip(Vehicles._fields, new, vehicles, strict=True)
+    )
+    return Vehicles(*merged)
+
+
+def look(scenario: Scenario, state: State) -> tuple[State, Tensor, Tensor]:
+    """What is observed in a state.
+
+    Returns:
+        ``ego`` [B, 9] and ``vehicles`` [B, M, 6] as they are sensed; ``ego`` as it is; and which
+        vehicles are within view [B, N].
+    """
+    vehicles = vehicles_of(state)
+    others = vehicle_states(vehicles, _lanes(state, _LANE))
+    scene, route, rows = state["ego"], state["route"], scenario.rows
+    own, table, observed = observe(scene, others, state[_VEHICLE + "present"], route, rows)
+    observation = {"ego": own, "vehicles": table, "route": route}
+    if not scenario.traffic.sensed_exactly:
+        present, slot = (
+            state[_VEHICLE + "present"],
+            torch.arange(len(vehicles.s), device=others.device),
+        )
+        sensed = sense(scenario.traffic, others, present, slot, state["seed"], state["steps"])
+        observation["ego"], observation["vehicles"], _ = observe(scene, *sensed, route, rows)
+    return observation, own, observed
+
+
+def advance(scenario: Scenario, state: State, action: Tensor) -> tuple[State, State]:
+    """One decision of every environment: a pure function, without a loop over them or vehicles.
+
+    Args:
+        scenario: settings.
+        state: as :func:`begin` gives, each [B, ...].
+        action: [B, 2] in [-1, 1].
+
+    Returns:
+        The next state, and the observation, outcomes, ``reward``, ``cost`` and ends.
+    """
+    control = to_physical(action)
+    ego, route, steps, vehicles = state["ego"], state["route"], state["steps"], vehicles_of(state)
+    previous = torch.where(steps[:, None] == 0, control, state["control"])
+    lane, own = _lanes(state, _LANE), _lanes(state, _OWN)
+    zone = state["zone_begin"].movedim(0, -1), state["zone_end"].movedim(0, -1)
+    cost = scenario.cost(ego, control, vehicle_states(vehicles, lane), state["observed"])
+
+    time = steps.to(ego.dtype) / scenario.policy_frequency
+    due = steps % scenario.rules_every == 0
+    traffic = scenario.traffic.vehicles[1] > 0
+    if traffic:
+        vehicles = _choose(due, road_rules(vehicles, lane, own, zone, ego, time), vehicles)
+    collision = torch.zeros_like(due)
+    for _ in range(SUBSTEPS):  # a collision ends a decision at once
+        if traffic:
+            moved = move(vehicles, lane, accelerate(vehicles, lane, ego), scenario.dt)
+            vehicles = _choose(collision, vehicles, moved)
+        ego = torch.where(collision[:, None], ego, step_ego(ego, control, scenario.dt))
+        place, _ = lane_frames(lane, vehicles.s)
+        hit = frames_overlap(frame(ego[:, 0], ego[:, 1], ego[:, 4]), place)
+        collision = collision | (hit & vehicles.present).any(0)
+    after = state | {
+        "ego": ego,
+        "control": control,
+        "steps": steps + 1,
+        "still": torch.where(ego[:, 2] < STANDING, state["still"] + 1, 0),
+    }
+    if scenario.traffic.respawn:
+        vehicles = _respawn(scenario, vehicles, state)
+        after |= _roads(vehicles, route)
+    after |= _named(_VEHICLE, vehicles)
+    observation, true, observed = look(scenario, after)
+    off = offroad(ego)
+    success = arrived(ego, route) & ~off & ~collision
+    reward = scenario.reward(
+        ego,
+        route,
+        control,
+        previous,
+        true[:, 7],
+        true[:, 8],
+        observed.any(-1),
+        off | collision,
+        success,
+    )
+    terminated = off | collision | success
+    truncated = (after["steps"] >= scenario.horizon) | (after["still"] >= scenario.patience)
+    return after | {"observed": observed}, observation | {
+        "collision": collision, "offroad": off, "success": success, "reward": reward, "cost": cost,
+        "terminated": terminated, "truncated": truncated, "done": terminated | truncated,
+    }  # fmt: skip
 
 
 class BatchedIntersection(IntersectionBase):
-    """The CMDP on an empty road, B environments in one set of tensors, on CPU or GPU.
+    """The CMDP with traffic, B environments in one set of tensors, on CPU or GPU.
 
     Args:
-        scenario: the task; ``vehicles`` must be 0, traffic needs the highway-env backend.
+        scenario: the task.
         num_envs: B.
         seed: of the sequences of episodes.
         device: torch device.
+        compile_physics: compile the step and the reset: several times faster, after half a minute (or a few
+            seconds, once torch has it in its cache on disk).
 
-    >>> env = BatchedIntersection(Scenario(task="lt", vehicles=0), num_envs=3)
-    >>> env.rollout(4)["next", "ego"].shape
-    torch.Size([3, 4, 9])
+    >>> env = BatchedIntersection(Scenario(task="lt"), num_envs=3)
+    >>> env.rollout(4)["next", "vehicles"].shape
+    torch.Size([3, 4, 11, 6])
     """
 
-    def __init__(self, scenario: Scenario, num_envs: int = 1, seed: int = 0, device=None):
-        if scenario.vehicles:
-            raise ValueError(
-                f"env=batched drives on an empty road: vehicles must be 0, got {scenario.vehicles}. "
-                "Use env=highway for traffic."
-            )
+    def __init__(
+        self,
+        scenario: Scenario,
+        num_envs: int = 1,
+        seed: int = 0,
+        device=None,
+        compile_physics: bool = False,
+    ):
         super().__init__(scenario, num_envs, seed, device)
-        self._vehicles = torch.zeros(num_envs, 0, 6, device=device)
-        self._present = torch.zeros(num_envs, 0, dtype=torch.bool, device=device)
-        self._state: dict[str, Tensor] = {}
-
-    def _observe(self) -> tuple[dict[str, Tensor], Tensor]:
-        ego, route = self._state["ego"], self._state["route"]
-        own, vehicles, observed = observe(
-            ego, self._vehicles, self._present, route, self.scenario.rows
-        )
-        return {"ego": own, "vehicles": vehicles, "route": route}, observed
+        self._restart, self._advance = partial(restart, scenario), partial(advance, scenario)
+        if compile_physics:
+            log.info(
+                "Compiling the simulation at its first step: about half a minute, less the next time."
+            )
+            warnings.filterwarnings("ignore", category=UserWarning, module="torch._inductor")
+            settings = {"fullgraph": True, "dynamic": False}
+            self._restart = partial(torch.compile(restart, **settings), scenario)
+            self._advance = partial(torch.compile(advance, **settings), scenario)
+        self._state: State = {}
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         reset = self._reset_mask(tensordict)
         seeds = self._next_seeds(tensordict, reset)
-        route = draw_route(self.scenario.task, seeds)
-        fresh = {
-            "ego": draw_start(route, seeds, self.scenario.route_starts).float(),
-            "control": torch.zeros(*self.batch_size, 2, device=self.device),
-            "steps": torch.zeros(self.batch_size, dtype=torch.int64, device=self.device),
-            "still": torch.zeros(self.batch_size, dtype=torch.int64, device=self.device),
-            "route": route,
-        }
-        old = self._state or fresh
-        self._state = {
-            key: torch.where(reset.reshape(-1, *[1] * (value.ndim - 1)), value, old[key])
-            for key, value in fresh.items()
-        }
-        observation, _ = self._observe()
+        state = self._state or begin(self.scenario, seeds)
+        self._state, observation = self._restart(state, seeds, reset)
         no = torch.zeros_like(reset)
         return self._output(observation | {"collision": no, "offroad": no, "success": no})
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        scenario, state = self.scenario, self._state
-        control = to_physical(tensordict["action"])
-        previous = torch.where(state["steps"][:, None] == 0, control, state["control"])
-        _, observed = self._observe()
-        cost = scenario.cost(state["ego"], control, self._vehicles, observed)
-        ego = state["ego"]
-        for _ in range(SUBSTEPS):
-            ego = step_ego(ego, control, scenario.dt)
-        self._state = state | {
-            "ego": ego,
-            "control": control,
-            "steps": state["steps"] + 1,
-            "still": torch.where(ego[:, 2] < STANDING, state["still"] + 1, 0),
-        }
-        observation, observed = self._observe()
-        off = offroad(ego)
-        collision = torch.zeros_like(off)
-        success = arrived(ego, state["route"]) & ~off & ~collision
-        own = observation["ego"]
-        reward = scenario.reward(
-            ego, state["route"], control, previous, own[:, 7], own[:, 8], observed.any(-1),
-            off | collision, success,
-        )  # fmt: skip
-        terminated = off | collision | success
-        truncated = self._state["steps"] >= scenario.horizon
-        truncated = truncated | (self._state["still"] >= scenario.patience)
-        return self._output(
-            observation
-            | {
-                "collision": collision,
-                "offroad": off,
-                "success": success,
-                "reward": reward,
-                "cost": cost,
-                "terminated": terminated,
-                "truncated": truncated,
-                "done": terminated | truncated,
-            }
-        )
+        self._state, output = self._advance(self._state, tensordict["action"])
+        return self._output(output)
 
     def snapshot(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        others = self._vehicles[index][self._present[index]]
+        state = {key: value[index] for key, value in self._state.items()}
+        vehicles = vehicles_of(state)
+        others = vehicle_states(vehicles, _lanes(state, _LANE))[vehicles.present]
         return self._state["ego"][index].double().cpu().numpy(), others.double().cpu().numpy()
+
+    def render(self, index: int) -> np.ndarray:
+        """The scene [600, 600, 3] uint8 of one environment, drawn by highway-env's graphics."""
+        from saferl.envs.intersection.rendering import draw_state  # late: needs pygame
+
+        return draw_state({key: value[index].cpu() for key, value in self._state.items()})
 
     def state_dict(self, *args, **kwargs) -> dict[str, Tensor]:
         """Everything that decides what comes next: vehicle states and episode sequences."""
@@ -149,4 +273,4 @@ class BatchedIntersection(IntersectionBase):
         """Continue exactly where :meth:`state_dict` was taken."""
         state = {key: value.to(self.device or "cpu").clone() for key, value in state_dict.items()}
         self._stream, self._episode = state.pop("stream"), state.pop("episode")
-        self._state = state
+        self._state = scenes_last(state)

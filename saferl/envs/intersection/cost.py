@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from saferl.envs.intersection.dynamics import predict_vehicles, step_ego
-from saferl.envs.intersection.geometry import overlap
+from saferl.envs.intersection.geometry import frame, frames_overlap
 
 
 @dataclass(frozen=True)
@@ -66,11 +66,14 @@ class CollisionCost:
         own = []
         for _ in range(self.steps):
             ego = step_ego(ego, control, self.dt)
-            own.append(torch.stack([ego[..., 0], ego[..., 1], ego[..., 4]], -1))
-        poses = predict_vehicles(vehicles, self.dt, self.steps)  # [..., N, T, 3]
-        hits = overlap(torch.stack(own, -2)[..., None, :, :], poses, scale=beta)
-        count = (hits & observed[..., None]).sum(-2).to(ego.dtype)  # [..., T]
-        total = (
-            self.initial * speed / self.base_speed * (count * torch.exp(-self.decay * beta)).sum(-1)
-        )
-        return total / observed.sum(-1).clamp_min(1)
+            own.append(ego)
+        own = frame(*(torch.stack([e[..., k] for e in own]) for k in (0, 1, 4)))  # [T, ...]
+        others = frame(
+            *predict_vehicles(vehicles.movedim(-2, 0), self.dt, self.steps)
+        )  # [T, N, ...]
+        beta = beta.reshape(-1, *[1] * speed.ndim)
+        hits = frames_overlap(own.at((slice(None), None)), others, scale=beta[:, None])
+        observed = observed.movedim(-1, 0)
+        count = (hits & observed).sum(1)  # [T, ...]
+        total = (self.initial / self.base_speed * torch.exp(-self.decay * beta) * count).sum(0)
+        return total * speed / observed.sum(0).clamp_min(1)

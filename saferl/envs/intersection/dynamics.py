@@ -9,6 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from saferl.envs.intersection.geometry import columns
+
 MASS = 1412.0  # kg
 INERTIA = 1536.7  # kg m^2, about the vertical axis
 L_F, L_R = 1.06, 1.85  # m, centre of gravity to the axles
@@ -45,16 +47,13 @@ def step_ego(state: Tensor, control: Tensor, dt: float) -> Tensor:
     new_omega = (-INERTIA * omega * v_x - dt * (moment * v_y - L_F * C_F * delta * v_x)) / (
         dt * (L_F**2 * C_F + L_R**2 * C_R) - INERTIA * v_x
     )
-    return torch.stack(
-        [
-            x + dt * (v_x * cos - v_y * sin),
-            y + dt * (v_x * sin + v_y * cos),
-            (v_x + dt * (a_x + v_y * omega)).clamp_min(0.0),
-            new_v_y,
-            phi + dt * omega,
-            new_omega,
-        ],
-        -1,
+    return columns(
+        x + dt * (v_x * cos - v_y * sin),
+        y + dt * (v_x * sin + v_y * cos),
+        (v_x + dt * (a_x + v_y * omega)).clamp_min(0.0),
+        new_v_y,
+        phi + dt * omega,
+        new_omega,
     )
 
 
@@ -67,39 +66,41 @@ def step_vehicle(state: Tensor, dt: float) -> Tensor:
     """
     x, y, v_x, v_y, phi, omega = state.unbind(-1)
     cos, sin = torch.cos(phi), torch.sin(phi)
-    return torch.stack(
-        [
-            x + dt * (v_x * cos - v_y * sin),
-            y + dt * (v_x * sin + v_y * cos),
-            v_x,
-            torch.zeros_like(v_y),
-            phi + dt * omega,
-            omega,
-        ],
-        -1,
+    return columns(
+        x + dt * (v_x * cos - v_y * sin),
+        y + dt * (v_x * sin + v_y * cos),
+        v_x,
+        torch.zeros_like(v_y),
+        phi + dt * omega,
+        omega,
     )
 
 
-def predict_vehicles(state: Tensor, dt: float, steps: int) -> Tensor:
-    """Poses [..., steps, 3] (x, y, heading) that ``steps`` calls of :func:`step_vehicle` give.
+def predict_vehicles(state: Tensor, dt: float, steps: int) -> tuple[Tensor, Tensor, Tensor]:
+    """x, y and heading, each [steps, ...], that ``steps`` calls of :func:`step_vehicle` give.
 
-    The sums over time are taken at once, without a loop.
+    The sums over time are taken at once, in closed form: sum of cos(phi + k a) for k = 0 .. n - 1 is
+    sin(n a / 2) / sin(a / 2) cos(phi + (n - 1) a / 2).
 
     Args:
         state: [..., 6].
         dt: seconds.
         steps: how many.
     """
-    x, y, v_x, v_y, phi, omega = state[..., None, :].unbind(-1)
-    index = torch.arange(steps, dtype=state.dtype, device=state.device)
-    heading = phi + dt * index * omega
-    cos, sin = torch.cos(heading), torch.sin(heading)
-    slip = torch.where(index == 0, v_y, 0.0)
-    return torch.stack(
-        [
-            x + dt * (v_x * cos - slip * sin).cumsum(-1),
-            y + dt * (v_x * sin + slip * cos).cumsum(-1),
-            heading + dt * omega,
-        ],
-        -1,
+    x, y, v_x, v_y, phi, omega = state.unbind(-1)
+    count = torch.arange(1, steps + 1, dtype=state.dtype, device=state.device)
+    count = count.reshape(-1, *[1] * x.ndim)
+    half = dt * omega / 2
+    turning = half.abs() > 1e-6
+    share = torch.where(
+        turning, torch.sin(count * half) / torch.where(turning, half, 1.0).sin(), count
+    )
+    middle = phi + (count - 1) * half
+    forward = dt * v_x * share
+    # The sideways speed lasts for the first step.
+    cos, sin = torch.cos(phi), torch.sin(phi)
+    return (
+        x + forward * torch.cos(middle) - dt * v_y * sin,
+        y + forward * torch.sin(middle) + dt * v_y * cos,
+        phi + dt * omega * count,
     )

@@ -8,7 +8,7 @@ batch dimensions and any floating dtype, and loops over no vehicle.
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -91,10 +91,40 @@ _TARGETS = torch.tensor(
 _EXITS = torch.tensor([[-1.0, 0.0], [0.0, -1.0], [0.0, -1.0], [1.0, 0.0]], dtype=torch.float64)
 
 
-@lru_cache(maxsize=32)
-def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    lines, targets, exits = (t.to(device=device, dtype=dtype) for t in (_LINES, _TARGETS, _EXITS))
-    return lines, targets, exits
+class Constants:
+    """Constant tensors, cast once to each dtype and device (a dict, as torch.compile sees through it).
+
+    Args:
+        *tensors: what is constant.
+    """
+
+    def __init__(self, *tensors: Tensor):
+        self.tensors = tensors
+        self._cast: dict[tuple[torch.dtype, torch.device], tuple[Tensor, ...]] = {}
+
+    def like(self, like: Tensor) -> tuple[Tensor, ...]:
+        """The tensors in the dtype and on the device of ``like``."""
+        key = (like.dtype, like.device)
+        if key not in self._cast:
+            self._cast[key] = tuple(
+                t.to(device=like.device, dtype=like.dtype) for t in self.tensors
+            )
+        return self._cast[key]
+
+
+_TABLES = Constants(_LINES, _TARGETS, _EXITS)
+
+
+def columns(*parts: Tensor) -> Tensor:
+    """Stack parts [...] along a new last dimension that comes first in memory.
+
+    A vehicle's numbers then lie as far apart as there are scenes, and the same number of all scenes
+    side by side, which is how vector units like to read them.
+
+    >>> columns(torch.zeros(3), torch.ones(3)).stride()
+    (1, 3)
+    """
+    return torch.stack(parts).movedim(0, -1)
 
 
 def wrap(angle: Tensor) -> Tensor:
@@ -107,24 +137,25 @@ def reference_lines(route: Tensor, like: Tensor) -> Tensor:
 
     ``route`` [...] int64 indexes :data:`ROUTES`; ``like`` gives dtype and device.
     """
-    return _tables(like.dtype, like.device)[0][route]
+    lines = _TABLES.like(like)[0].movedim(0, -1)[..., route]  # scenes side by side in memory
+    return lines.movedim((0, 1, 2), (-3, -2, -1))
 
 
 def target_points(route: Tensor, like: Tensor) -> Tensor:
     """The two target points [..., 2, 2] in metres: middles of the exit lanes, 25 m past the box."""
-    return _tables(like.dtype, like.device)[1][route]
+    return _TABLES.like(like)[1][route]
 
 
-def _advance(segment: Tensor, s: Tensor) -> Tensor:
+def _advance(segment: tuple[Tensor, ...], s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Pose (x, y, heading) at arc length ``s`` from the start of constant-curvature segments."""
-    x, y, heading, curvature = segment[..., :4].unbind(-1)
+    x, y, heading, curvature = segment[:4]
     half = curvature * s / 2
     chord = s * torch.special.sinc(half / math.pi)
-    return torch.stack(
-        [x + chord * torch.cos(heading + half), y + chord * torch.sin(heading + half),
-         heading + 2 * half],
-        -1,
-    )  # fmt: skip
+    return (
+        x + chord * torch.cos(heading + half),
+        y + chord * torch.sin(heading + half),
+        heading + 2 * half,
+    )
 
 
 def line_pose(lines: Tensor, s: Tensor) -> Tensor:
@@ -140,7 +171,7 @@ def line_pose(lines: Tensor, s: Tensor) -> Tensor:
     starts = lines[..., 5]
     index = (s[..., None] >= starts[..., 1:]).sum(-1)[..., None, None]
     segment = lines.gather(-2, index.expand(*index.shape[:-1], 6)).squeeze(-2)
-    return _advance(segment, s - segment[..., 5])
+    return columns(*_advance(segment.unbind(-1), s - segment[..., 5]))
 
 
 def project(position: Tensor, lines: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -153,8 +184,9 @@ def project(position: Tensor, lines: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     Returns:
         Pose of the nearest point [..., 3], its arc length [...] and its distance [...], metres.
     """
-    x, y, heading, curvature, length, start = lines.unbind(-1)
-    dx, dy = position[..., None, 0] - x, position[..., None, 1] - y
+    # The four segments come first here.
+    x, y, heading, curvature, length, start = lines.movedim(-2, 0).unbind(-1)
+    dx, dy = position[..., 0] - x, position[..., 1] - y
     cos, sin = torch.cos(heading), torch.sin(heading)
     along, across = dx * cos + dy * sin, dy * cos - dx * sin
     bent = curvature != 0
@@ -163,13 +195,15 @@ def project(position: Tensor, lines: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     angle = torch.atan2(along, k.abs().reciprocal() - across * k.sign())
     s = torch.where(bent, angle / k.abs(), along)
     s = torch.minimum(s.clamp_min(0.0), length)
-    poses = _advance(lines, s)
-    gap = torch.hypot(
-        position[..., None, 0] - poses[..., 0], position[..., None, 1] - poses[..., 1]
-    )
-    distance, index = gap.min(-1)
-    pose = poses.gather(-2, index[..., None, None].expand(*index.shape, 1, 3)).squeeze(-2)
-    return pose, (s + start).gather(-1, index[..., None]).squeeze(-1), distance
+    pose = _advance((x, y, heading, curvature), s)
+    gap = torch.hypot(position[..., 0] - pose[0], position[..., 1] - pose[1])
+    number = torch.arange(4, device=gap.device).reshape(4, *[1] * (gap.ndim - 1))
+    nearest = number == gap.argmin(0)
+
+    def pick(value: Tensor) -> Tensor:
+        return torch.where(nearest, value, 0.0).sum(0)
+
+    return columns(*(pick(part) for part in pose)), pick(s + start), gap.amin(0)
 
 
 def corners(pose: Tensor, length: float = LENGTH, width: float = WIDTH) -> Tensor:
@@ -183,6 +217,43 @@ def corners(pose: Tensor, length: float = LENGTH, width: float = WIDTH) -> Tenso
          centre - forward - left, centre - forward + left],
         -2,
     )  # fmt: skip
+
+
+class Frame(NamedTuple):
+    """Poses with the cosine and sine of their headings, each [...]."""
+
+    x: Tensor
+    y: Tensor
+    cos: Tensor
+    sin: Tensor
+
+    def at(self, index) -> Frame:
+        """Some of the frames, or with more dimensions, as by indexing a tensor."""
+        return Frame(*(field[index] for field in tuple(self)))
+
+
+def frame(x: Tensor, y: Tensor, heading: Tensor) -> Frame:
+    """Frames [...] of poses given by their parts, each [...]."""
+    return Frame(x, y, torch.cos(heading), torch.sin(heading))
+
+
+def frames_overlap(
+    a: Frame,
+    b: Frame,
+    size_a: tuple[float, float] = (LENGTH, WIDTH),
+    size_b: tuple[float, float] = (LENGTH, WIDTH),
+    scale: Tensor | float = 1.0,
+) -> Tensor:
+    """:func:`overlap` of rectangles at frames [...], broadcast against each other."""
+    dx, dy = b.x - a.x, b.y - a.y
+    cos, sin = (a.cos * b.cos + a.sin * b.sin).abs(), (a.sin * b.cos - a.cos * b.sin).abs()
+    (la, wa), (lb, wb) = ([side * scale / 2 for side in size] for size in (size_a, size_b))
+
+    def apart(c, s, l0, w0, l1, w1) -> Tensor:
+        along, across = (dx * c + dy * s).abs(), (dy * c - dx * s).abs()
+        return (along > l0 + l1 * cos + w1 * sin) | (across > w0 + l1 * sin + w1 * cos)
+
+    return ~(apart(a.cos, a.sin, la, wa, lb, wb) | apart(b.cos, b.sin, lb, wb, la, wa))
 
 
 def overlap(
@@ -202,17 +273,8 @@ def overlap(
     Returns:
         bool [...].
     """
-    dx, dy = pose_b[..., 0] - pose_a[..., 0], pose_b[..., 1] - pose_a[..., 1]
-    turn = pose_b[..., 2] - pose_a[..., 2]
-    cos, sin = torch.cos(turn).abs(), torch.sin(turn).abs()
-    (la, wa), (lb, wb) = ([side * scale / 2 for side in size] for size in (size_a, size_b))
-
-    def apart(heading: Tensor, l0, w0, l1, w1) -> Tensor:
-        c, s = torch.cos(heading), torch.sin(heading)
-        along, across = (dx * c + dy * s).abs(), (dy * c - dx * s).abs()
-        return (along > l0 + l1 * cos + w1 * sin) | (across > w0 + l1 * sin + w1 * cos)
-
-    return ~(apart(pose_a[..., 2], la, wa, lb, wb) | apart(pose_b[..., 2], lb, wb, la, wa))
+    a, b = (frame(*pose.unbind(-1)) for pose in (pose_a, pose_b))
+    return frames_overlap(a, b, size_a, size_b, scale)
 
 
 def on_pavement(points: Tensor) -> Tensor:
@@ -225,13 +287,19 @@ def on_pavement(points: Tensor) -> Tensor:
 
 def offroad(state: Tensor) -> Tensor:
     """Whether a corner of the vehicle with ``state`` [..., 6] has left the pavement: bool [...]."""
-    pose = torch.stack([state[..., 0], state[..., 1], state[..., 4]], -1)
-    return ~on_pavement(corners(pose)).all(-1)
+    x, y, heading = state[..., 0], state[..., 1], state[..., 4]
+    cos, sin = torch.cos(heading), torch.sin(heading)
+    inside = [
+        on_pavement(columns(x + forward * cos - left * sin, y + forward * sin + left * cos))
+        for forward in (-LENGTH / 2, LENGTH / 2)
+        for left in (-WIDTH / 2, WIDTH / 2)
+    ]
+    return ~torch.stack(inside).all(0)
 
 
 def arrived(state: Tensor, route: Tensor) -> Tensor:
     """Whether the vehicle is past 25 m on its exit arm, within one of its two lanes: bool [...]."""
-    exits = _tables(state.dtype, state.device)[2][route]
+    exits = _TABLES.like(state)[2][route]
     along = state[..., 0] * exits[..., 0] + state[..., 1] * exits[..., 1]
     right = state[..., 1] * exits[..., 0] - state[..., 0] * exits[..., 1]
     return (along >= HALF_BOX + EXIT_DISTANCE) & (right >= 0) & (right <= _HALF_ROAD)

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-from saferl.envs.intersection.base import STANDING, SUBSTEPS, Scenario
-from saferl.envs.intersection.batched import draw_route, draw_start
+from saferl.envs.intersection.base import STANDING, SUBSTEPS, Scenario, build
 from saferl.envs.intersection.cost import CollisionCost
 from saferl.envs.intersection.dynamics import to_physical
 from saferl.envs.intersection.geometry import (
@@ -27,20 +26,15 @@ from saferl.envs.intersection.observation import ROWS, observe
 from saferl.envs.intersection.regulation import IntersectionRoad
 from saferl.envs.intersection.rendering import Renderer
 from saferl.envs.intersection.reward import Reward
-from saferl.envs.intersection.traffic import EgoVehicle, draw_traffic
-
-
-def _build(name: str, kind: type, value: Any) -> Any:
-    if isinstance(value, kind):
-        return value
-    if not isinstance(value, Mapping | None):
-        raise ValueError(f"{name} must be a {kind.__name__} or a mapping, got {value!r}.")
-    settings = dict(value or {})
-    known = list(kind.__dataclass_fields__)
-    for key in settings:
-        if key not in known:
-            raise ValueError(f"{name}.{key} is unknown; choose from {', '.join(known)}.")
-    return kind(**settings)
+from saferl.envs.intersection.spawning import (
+    Traffic,
+    draw_route,
+    draw_start,
+    draw_traffic,
+    enter,
+    sense,
+)
+from saferl.envs.intersection.vehicles import EgoVehicle
 
 
 class IntersectionEnv(gymnasium.Env):
@@ -56,7 +50,8 @@ class IntersectionEnv(gymnasium.Env):
     in :data:`ROUTES`) and ``start`` (the ego's state [6]).
 
     Args:
-        task, vehicles, rows, policy_frequency, duration, route_starts, standstill: see :class:`Scenario`.
+        task, vehicles, scenario, traffic, rows, policy_frequency, duration, route_starts, standstill:
+            see :class:`Scenario`.
         reward: a :class:`Reward` or its fields, e.g. ``{"reading": "raw", "risk_shaping": True}``.
         cost: a :class:`CollisionCost` or its fields.
         render_mode: None or ``rgb_array``.
@@ -72,7 +67,9 @@ class IntersectionEnv(gymnasium.Env):
     def __init__(
         self,
         task: str = "mixed",
-        vehicles: int = 10,
+        vehicles: int | None = None,
+        scenario: str = "nominal",
+        traffic: Traffic | Mapping[str, Any] | None = None,
         rows: int = ROWS,
         policy_frequency: int = 5,
         duration: float = 25.0,
@@ -83,9 +80,10 @@ class IntersectionEnv(gymnasium.Env):
         render_mode: str | None = None,
     ):
         self.scenario = Scenario(
-            task=task, vehicles=vehicles, rows=rows, policy_frequency=policy_frequency,
-            duration=duration, route_starts=route_starts, standstill=standstill, reward=_build("reward", Reward, reward),
-            cost=_build("cost", CollisionCost, cost),
+            task=task, vehicles=vehicles, scenario=scenario, traffic=traffic or {}, rows=rows,
+            policy_frequency=policy_frequency, duration=duration, route_starts=route_starts,
+            standstill=standstill, reward=build("reward", Reward(), reward or {}),
+            cost=build("cost", CollisionCost(), cost or {}),
         )  # fmt: skip
         modes = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in modes:
@@ -148,18 +146,40 @@ class IntersectionEnv(gymnasium.Env):
             raise ValueError(f"options.start must have shape (6,), got {tuple(start.shape)}.")
         self.road.np_random = self.np_random  # pyright: ignore[reportAttributeAccessIssue]
         ego = EgoVehicle(self.road, start, int(self._route))
-        traffic = draw_traffic(self.np_random, self.road.table, self.scenario.vehicles, ego)
-        self.road.populate(ego, *traffic)
-        self._steps, self._still, self._control = 0, 0, None
+        self._seed, self._steps, self._still, self._control = draw, 0, 0, None
+        traffic = draw_traffic(self.scenario.traffic, self._route, start, draw)
+        self.road.populate(ego, traffic)
         return self._observe(), self._info(0.0, False, False, False)
 
     def _observe(self) -> dict[str, np.ndarray]:
-        self._vehicles = torch.from_numpy(self.road.states())
-        present = torch.ones(len(self._vehicles), dtype=torch.bool)
+        scenario, state = self.scenario, self.ego.state
+        self._vehicles = others = torch.from_numpy(self.road.states())
+        present = torch.ones(len(others), dtype=torch.bool)
         self._own, table, self._observed = observe(
-            self.ego.state, self._vehicles, present, self._route, self.scenario.rows
+            state, others, present, self._route, scenario.rows
         )
-        return {"ego": self._own.float().numpy(), "vehicles": table.float().numpy()}
+        own = self._own
+        if not scenario.traffic.sensed_exactly:
+            slot, steps = torch.from_numpy(self.road.slot), torch.tensor(self._steps)
+            sensed = sense(scenario.traffic, others, present, slot, self._seed, steps)
+            own, table, _ = observe(state, *sensed, self._route, scenario.rows)
+        return {"ego": own.float().numpy(), "vehicles": table.float().numpy()}
+
+    def _respawn(self) -> None:
+        """Let one vehicle that has left the road enter it again, if its approach is free."""
+        road, most = self.road, self.scenario.traffic.vehicles[1]
+        present = torch.zeros(most, dtype=torch.bool)
+        route, s = torch.zeros(most, dtype=torch.int64), torch.zeros(most, dtype=torch.float64)
+        slot = torch.from_numpy(road.slot)
+        present[slot], route[slot], s[slot] = (
+            True,
+            torch.from_numpy(road.route),
+            torch.from_numpy(road.s),
+        )
+        steps = torch.tensor(self._steps)
+        fresh = enter(self.scenario.traffic, self._route, self._seed, steps, present, route, s)
+        if fresh.present.any():
+            road.add(fresh)
 
     def _info(self, cost: float, collision: bool, off: bool, success: bool) -> dict[str, Any]:
         route = int(self._route)
@@ -193,6 +213,8 @@ class IntersectionEnv(gymnasium.Env):
             collision = self._collides()
             if collision:
                 break
+        if scenario.traffic.respawn:
+            self._respawn()
         self._control, self._steps = control, self._steps + 1
         observation = self._observe()
         off = bool(offroad(ego.state))

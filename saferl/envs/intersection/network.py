@@ -7,7 +7,7 @@ outer one. Everything here is numpy, because highway-env's objects are.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -20,6 +20,10 @@ from saferl.envs.intersection.geometry import ARM, HALF_BOX, LANE_WIDTH, LENGTH,
 SPEED_LIMIT = 10.0  # m/s
 #: Speed in the box by movement, m/s: 3.8 m/s^2 sideways on the left arc, 4 m/s^2 on the right one.
 TURN_SPEED = {"left": 8.0, "straight": SPEED_LIMIT, "right": 6.0}
+CORRIDOR = WIDTH / 2 + 0.3  # m to either side of the route that must be free of bodies
+#: Points of a vehicle's outline that are looked for in a corridor, m ahead and to the right.
+BODY = np.array([(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.5)]) * (LENGTH, WIDTH)
+BODY_STEP = 0.25  # m
 MOVEMENTS = (("left", 0), ("straight", 0), ("straight", 1), ("right", 1))
 _LEFT_RADIUS = HALF_BOX + LANE_WIDTH / 2
 _RIGHT_RADIUS = HALF_BOX - 1.5 * LANE_WIDTH
@@ -97,6 +101,10 @@ class Routes:
         approach: [16] number of the approach lane, 2 * arm + lane.
         zone: [16, 16, 2] arc lengths on route i between which a vehicle on route j can be hit in
             the box; empty (inf, -inf) where two routes never meet or share their approach lane.
+        body: [4, 16, S, 2] for a vehicle on route j at arc length ``BODY_STEP * k``: where its body
+            first reaches into the corridor of route i of arm 0, as an arc length on i minus its own
+            (m; inf where it does not), and the cosine of the angle between the two directions there.
+            Other arms are the same, turned.
     """
 
     lanes: list[tuple[LaneIndex, LaneIndex, LaneIndex]]
@@ -111,6 +119,7 @@ class Routes:
     turn_speed: np.ndarray
     approach: np.ndarray
     zone: np.ndarray
+    body: np.ndarray
 
     def pose(self, route: np.ndarray | int, s: np.ndarray | float) -> np.ndarray:
         """Pose [..., 3] (x, y, heading) at arc lengths ``s`` [...] m of ``route`` [...]."""
@@ -210,6 +219,24 @@ def _zones(routes: Routes, margin: float = 0.4, step: float = 0.5) -> np.ndarray
     return zone
 
 
+def _bodies(routes: Routes) -> np.ndarray:
+    """What a vehicle on each route puts into the corridor of each of arm 0, [4, 16, S, 2]."""
+    s = np.arange(0.0, routes.out.max() + ARM, BODY_STEP)
+    pose = routes.pose(np.arange(16)[:, None], s)  # [16, S, 3]
+    cos, sin = np.cos(pose[..., 2, None]), np.sin(pose[..., 2, None])
+    points = np.stack(
+        [pose[..., 0, None] + cos * BODY[:, 0] - sin * BODY[:, 1],
+         pose[..., 1, None] + sin * BODY[:, 0] + cos * BODY[:, 1]], -1,
+    )  # fmt: skip
+    body = np.empty((4, 16, len(s), 2))
+    for i in range(4):
+        where, lateral = routes.project(np.full((16, len(s)), i), points)
+        first = np.where(np.abs(lateral) < CORRIDOR, where, np.inf).min(-1)
+        heading = routes.pose(i, np.where(np.isfinite(first), first, 0.0))[..., 2]
+        body[i] = np.stack([first - s, np.cos(pose[..., 2] - heading)], -1)
+    return body
+
+
 @lru_cache(maxsize=1)
 def routes() -> Routes:
     """The routes of :func:`build_network`, read off its lanes.
@@ -243,5 +270,5 @@ def routes() -> Routes:
         "turn_speed": np.array([TURN_SPEED[movement] for movement, _ in MOVEMENTS] * 4),
         "approach": np.array([2 * (k // 4) + MOVEMENTS[k % 4][1] for k in range(16)]),
     }
-    bare = Routes(lanes=lanes, zone=np.empty(0), **table)
-    return Routes(lanes=lanes, zone=_zones(bare), **table)
+    bare = Routes(lanes=lanes, zone=np.empty(0), body=np.empty(0), **table)
+    return replace(bare, zone=_zones(bare), body=_bodies(bare))

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from saferl.envs.intersection.geometry import LENGTH, WIDTH, target_points
+from saferl.envs.intersection.geometry import LENGTH, WIDTH, columns, target_points
 
 AHEAD = 70.0  # m along the ego's heading
 BEHIND = 30.0
@@ -15,10 +15,11 @@ ROWS = 11
 _RADIUS = math.hypot(LENGTH / 4, WIDTH / 2)
 
 
-def _circles(state: Tensor) -> Tensor:
-    """Centres [..., 2, 2] of the two circles that stand for a vehicle."""
-    heading = torch.stack([torch.cos(state[..., 4]), torch.sin(state[..., 4])], -1) * (LENGTH / 4)
-    return torch.stack([state[..., :2] + heading, state[..., :2] - heading], -2)
+def _circles(state: Tensor) -> tuple[Tensor, Tensor]:
+    """Centres x, y, each [2, ...], of the two circles that stand for a vehicle."""
+    along, across = (LENGTH / 4 * f(state[..., 4]) for f in (torch.cos, torch.sin))
+    x, y = state[..., 0], state[..., 1]
+    return torch.stack([x + along, x - along]), torch.stack([y + across, y - across])
 
 
 def vehicle_distance(ego: Tensor, vehicles: Tensor, observed: Tensor) -> Tensor:
@@ -29,11 +30,12 @@ def vehicle_distance(ego: Tensor, vehicles: Tensor, observed: Tensor) -> Tensor:
         vehicles: [..., N, 6].
         observed: bool [..., N]; with none observed the distance is 70 m.
     """
-    offset = _circles(vehicles)[..., None, :] - _circles(ego)[..., None, None, :, :]
-    gap = offset.norm(dim=-1).flatten(-2).amin(-1) - 2 * _RADIUS
-    none = torch.full_like(ego[..., :1], torch.inf)  # also where there is no vehicle at all
-    nearest = torch.cat([torch.where(observed, gap, torch.inf), none], -1).amin(-1)
-    return torch.where(observed.any(-1), nearest, AHEAD)
+    (x, y), (own_x, own_y) = _circles(vehicles.movedim(-2, 0)), _circles(ego)
+    observed = observed.movedim(-1, 0)
+    gap = torch.hypot(x - own_x[:, None, None], y - own_y[:, None, None]).amin((0, 1)) - 2 * _RADIUS
+    gap = torch.where(observed, gap, torch.inf)
+    none = torch.full_like(ego[..., 0], torch.inf)[None]  # also where there is no vehicle at all
+    return torch.where(observed.any(0), torch.cat([gap, none]).amin(0), AHEAD)
 
 
 def destination_distance(ego: Tensor, route: Tensor) -> Tensor:
@@ -59,42 +61,35 @@ def observe(
         zero; and which of the N vehicles are observed, bool [..., N]. A vehicle's heading lies in
         [-3 pi / 4, 5 pi / 4): the seam is on no lane's direction.
     """
-    cos, sin = torch.cos(ego[..., 4]), torch.sin(ego[..., 4])
-    delta = vehicles[..., :2] - ego[..., None, :2]
-    ahead = delta[..., 0] * cos[..., None] + delta[..., 1] * sin[..., None]
-    distance = delta.norm(dim=-1)
-    seen = present & (ahead <= AHEAD) & (ahead >= -BEHIND)
+    # Vehicles come first here, [N, ...].
+    x, y, v_x, v_y, heading, _ = vehicles.movedim(-2, 0).unbind(-1)
+    own_x, own_y, own_v_x, own_v_y, phi, _ = ego.unbind(-1)
+    cos, sin = torch.cos(phi), torch.sin(phi)
+    dx, dy = x - own_x, y - own_y
+    ahead = dx * cos + dy * sin
+    seen = present.movedim(-1, 0) & (ahead <= AHEAD) & (ahead >= -BEHIND)
 
-    count = min(rows - 1, vehicles.shape[-2])
-    order = torch.where(seen, distance, torch.inf).argsort(dim=-1, stable=True)[..., :count]
-    observed = torch.zeros_like(seen).scatter(-1, order, True) & seen
+    # The row of each vehicle: how many are nearer.
+    distance = torch.where(seen, torch.hypot(dx, dy), torch.inf)
+    number = torch.arange(len(x), device=x.device).reshape(-1, *[1] * (x.ndim - 1))
+    tie = (distance[None] == distance[:, None]) & (number[None] < number[:, None])
+    row = ((distance[None] < distance[:, None]) | tie).sum(1)
+    count = min(rows - 1, len(x))
+    seen = seen & (row < count)
 
-    v_cos, v_sin = torch.cos(vehicles[..., 4]), torch.sin(vehicles[..., 4])
-    world_v = torch.stack([ego[..., 2] * cos - ego[..., 3] * sin,
-                           ego[..., 2] * sin + ego[..., 3] * cos], -1)  # fmt: skip
-    features = torch.cat(
-        [
-            torch.ones_like(distance)[..., None],
-            delta,
-            (vehicles[..., 2] * v_cos - vehicles[..., 3] * v_sin)[..., None]
-            - world_v[..., None, :1],
-            (vehicles[..., 2] * v_sin + vehicles[..., 3] * v_cos)[..., None]
-            - world_v[..., None, 1:],
-            (torch.remainder(vehicles[..., 4:5] + 0.75 * math.pi, 2 * math.pi) - 0.75 * math.pi),
-        ],
-        -1,
-    )
-    features = torch.where(seen[..., None], features, 0.0)
-    table = features.gather(-2, order[..., None].expand(*order.shape, 6))
-    table = torch.nn.functional.pad(table, (0, 0, 0, rows - count))
-
-    own = torch.cat(
-        [
-            torch.ones_like(ego[..., :1]),
-            ego,
-            vehicle_distance(ego, vehicles, observed)[..., None],
-            destination_distance(ego, route)[..., None],
-        ],
-        -1,
-    )
-    return own, table, observed
+    v_cos, v_sin = torch.cos(heading), torch.sin(heading)
+    features = [
+        torch.ones_like(x),
+        dx,
+        dy,
+        (v_x * v_cos - v_y * v_sin) - (own_v_x * cos - own_v_y * sin),
+        (v_x * v_sin + v_y * v_cos) - (own_v_x * sin + own_v_y * cos),
+        torch.remainder(heading + 0.75 * math.pi, 2 * math.pi) - 0.75 * math.pi,
+    ]
+    places = torch.arange(rows, device=x.device).reshape(-1, *[1] * x.ndim)
+    here = (places == row) & seen  # [M, N, ...]
+    table = torch.stack([torch.where(here, feature, 0.0).sum(1) for feature in features])
+    observed = seen.movedim(0, -1)
+    nearest = vehicle_distance(ego, vehicles, observed)
+    own = columns(torch.ones_like(phi), *ego.unbind(-1), nearest, destination_distance(ego, route))
+    return own, table.movedim((0, 1), (-1, -2)), observed

@@ -13,21 +13,38 @@ from highway_env.road.regulation import RegulatedRoad
 from highway_env.road.road import RoadNetwork
 
 from saferl.envs.intersection.geometry import ARM, LENGTH, WIDTH
-from saferl.envs.intersection.network import build_network, rectangles_overlap, routes
-from saferl.envs.intersection.traffic import EgoVehicle, RouteVehicle
+from saferl.envs.intersection.network import (
+    BODY,
+    BODY_STEP,
+    CORRIDOR,
+    build_network,
+    rectangles_overlap,
+    routes,
+)
+from saferl.envs.intersection.spawning import Drawn
+from saferl.envs.intersection.traffic import (
+    ACC_MAX,
+    ACCELERATION,
+    BODY_GAP,
+    BRAKING,
+    COMMIT,
+    DELTA,
+    EGO_ROOM,
+    GAP,
+    GO_SPEED,
+    PERIOD,
+    STOP,
+    STRETCH,
+    TIME_MARGIN,
+    TIMES,
+)
+from saferl.envs.intersection.vehicles import EgoVehicle, RouteVehicle
 
-PERIOD = 0.2  # s between two decisions of the traffic, at any policy frequency
-HORIZON = 2.0  # s of prediction (paper)
-TIMES = np.arange(0.25, HORIZON + 0.01, 0.25)
-STRETCH = 1.5  # predicted rectangles are 1.5 times as long, as in highway-env
-GO_SPEED = 4.0  # m/s, least speed at which a vehicle predicts its own crossing
-COMMIT = 5.0  # m/s^2; a vehicle that could not stop with it before the box has entered
-STOP = ARM - LENGTH / 2 - 1.0  # m, where a yielding vehicle's centre stops
-TIME_MARGIN = 0.5  # s between two vehicles in the zone where their routes cross
-CORRIDOR = WIDTH / 2 + 0.3  # m to either side of the route that must be free of bodies
-BODY_GAP = 3.0  # m kept from a body across the corridor
-EGO_ROOM = 2.0  # m more for the ego, which keeps to no line
-_BODY = np.array([(x, y) for x in (-0.5, 0.0, 0.5) for y in (-0.5, 0.5)]) * (LENGTH, WIDTH)
+
+_ARRAYS = {
+    "slot": int, "route": int, "s": float, "speed": float, "desired": float, "headway": float,
+    "heedless": bool, "acceleration": float, "held": bool, "stop": float,
+}  # fmt: skip
 
 
 class IntersectionRoad(RegulatedRoad):
@@ -51,34 +68,50 @@ class IntersectionRoad(RegulatedRoad):
     Attributes:
         ego: the ego vehicle, or None.
         traffic: the surrounding vehicles.
+        slot: their numbers when drawn [N].
         route, s, speed, desired: their routes [N], arc lengths [N] m, speeds and wanted speeds
             [N] m/s.
+        headway, heedless: time headways [N] s, and who ignores road priority [N].
         held: [N] bool, waits at the entry line; stop: [N] arc length where it must stop, or inf.
     """
 
     def __init__(self, network: RoadNetwork | None = None):
         super().__init__(network or build_network(), [], [])
         self.table = routes()
-        self.populate(None, np.zeros(0, int), np.zeros(0), np.zeros(0))
+        self.populate(None)
 
-    def populate(
-        self, ego: EgoVehicle | None, route: np.ndarray, s: np.ndarray, speed: np.ndarray
-    ) -> None:
-        """Put the ego and new surrounding vehicles on the road, and start its clock."""
-        self.ego = ego
-        self.traffic = [
-            RouteVehicle(self, r, at, v, self.table)
-            for r, at, v in zip(route, s, speed, strict=True)
-        ]
-        self.vehicles = ([ego] if ego is not None else []) + self.traffic
-        self.route, self.s = np.array(route, int), np.array(s, float)
-        self.speed, self.desired = np.array(speed, float), np.array(speed, float)
-        self.acceleration = np.zeros(len(route))
-        self.entered = np.full(len(route) + 1, np.inf)  # s, the ego last
-        self.held = np.zeros(len(route), bool)
-        self.stop = np.full(len(route), np.inf)
-        self.pose = self.table.pose(self.route, self.s)
+    def populate(self, ego: EgoVehicle | None, drawn: Drawn | None = None) -> None:
+        """Put the ego and the vehicles that are present in ``drawn`` on the road; start its clock."""
+        self.ego, self.traffic = ego, []
+        for name, kind in _ARRAYS.items():
+            setattr(self, name, np.zeros(0, kind))
+        self.pose = np.zeros((0, 3))
+        self.entered = np.full(1, np.inf)  # s, the ego last
         self.time, self.next_pass = 0.0, 0.0
+        if drawn is not None:
+            self.add(drawn)
+        self.vehicles = ([ego] if ego is not None else []) + self.traffic
+
+    def add(self, drawn: Drawn) -> None:
+        """Put more vehicles on the road, those that are present in ``drawn`` [N]."""
+        there = drawn.present.numpy()
+        slot, count = there.nonzero()[0], int(there.sum())
+        route, s, speed, headway, heedless = (value.numpy()[there] for value in drawn[1:])
+        zero = np.zeros(count)
+        new = {
+            "slot": slot, "route": route, "s": s, "speed": speed, "desired": speed,
+            "headway": headway, "heedless": heedless, "acceleration": zero, "held": zero,
+            "stop": zero + np.inf, "pose": self.table.pose(route, s),
+        }  # fmt: skip
+        for name, value in new.items():
+            old = getattr(self, name)
+            setattr(self, name, np.concatenate([old, value.astype(old.dtype)]))
+        self.entered = np.insert(self.entered, -1, [np.inf] * count)
+        self.traffic += [
+            RouteVehicle(self, r, at, v, t, self.table)
+            for r, at, v, t in zip(route, s, speed, headway, strict=True)
+        ]
+        self.vehicles = ([self.ego] if self.ego is not None else []) + self.traffic
 
     def states(self) -> np.ndarray:
         """States [N, 6] of the surrounding vehicles: x, y, v_x, 0, phi, omega."""
@@ -108,7 +141,7 @@ class IntersectionRoad(RegulatedRoad):
 
         The ego keeps its distance and angle to its route.
         """
-        path = self.table.pose(route[:, None], s[:, None] + pace[:, None] * TIMES)
+        path = self.table.pose(route[:, None], s[:, None] + pace[:, None] * np.array(TIMES))
         if self.ego is not None:
             x, y, heading = self.table.pose(route[-1], s[-1])
             lateral = (self.ego.position[1] - y) * np.cos(heading) - (
@@ -139,10 +172,12 @@ class IntersectionRoad(RegulatedRoad):
         inside = np.isfinite(entered)
 
         arrival = np.maximum(ARM - LENGTH / 2 - s, 0.0) / np.maximum(speed, 1.0)
-        rank = np.where(
-            inside, 1e6 - np.where(inside, entered, 0.0), table.priority[route] * 1e3 - arrival
-        )
-        rank += s * 1e-6 - np.arange(total) * 1e-9  # no ties
+        right_of_way = table.priority[route] * 100.0 - arrival
+        rank = np.where(inside, 1000.0 - np.where(inside, entered, 0.0), right_of_way)
+        # Places in the order of rank, ties by distance and number.
+        order = np.lexsort((-np.arange(total), s, rank))
+        rank = np.empty(total)
+        rank[order] = np.arange(total)
 
         # The first vehicle on each approach lane that has not entered.
         waiting = present & ~inside
@@ -163,7 +198,8 @@ class IntersectionRoad(RegulatedRoad):
         self.held = np.zeros(count, bool)
         for i in np.argsort(-rank):
             if i < count and head[i]:
-                self.held[i] = blocked[i] or (meet[i] & free & (rank > rank[i])).any()
+                waits = blocked[i] or (meet[i] & free & (rank > rank[i])).any()
+                self.held[i] = waits and not self.heedless[i]
                 free[i] = not self.held[i]
         stop = self._stops_in_box(route, s, rank, inside, clash, meet)
         self.stop = np.where(self.held, STOP, stop)
@@ -182,7 +218,8 @@ class IntersectionRoad(RegulatedRoad):
             other_pace = np.maximum(self.speed, 0.5)
             other_begin = np.maximum(other[..., 0] - s, 0.0) / other_pace
             other_end = (other[..., 1] - s) / other_pace
-        return crossing & (begin < other_end + TIME_MARGIN) & (other_begin < end + TIME_MARGIN)
+        margin = TIME_MARGIN * self.headway[:, None]
+        return crossing & (begin < other_end + margin) & (other_begin < end + margin)
 
     def _stops_in_box(self, route, s, rank, inside, clash, meet) -> np.ndarray:
         """[N] arc length before which a vehicle that has entered must stop for an earlier one."""
@@ -211,22 +248,20 @@ class IntersectionRoad(RegulatedRoad):
         if not count:
             return
         table, s, v, route = self.table, self.s, self.speed, self.route
-        top, best = RouteVehicle.COMFORT_ACC_MAX, -RouteVehicle.COMFORT_ACC_MIN
         # Slow down in time for the box, keep its speed limit, and speed up after it.
         limit = np.sqrt(table.turn_speed[route] ** 2 + 2 * 2.0 * np.maximum(ARM - s, 0.0))
         limit = np.where(s > table.out[route], np.inf, limit)
         wanted = np.minimum(self.desired, limit)
-        a = top * (1 - (v / wanted) ** RouteVehicle.DELTA)
+        a = ACCELERATION * (1 - (v / wanted) ** DELTA)
 
         gap, pace, along = self._leaders()
         gap = np.maximum(gap, 0.1)
         spacing = (
-            RouteVehicle.DISTANCE_WANTED
-            - LENGTH
-            + v[:, None] * RouteVehicle.TIME_WANTED
-            + v[:, None] * (v[:, None] - pace) / (2 * np.sqrt(top * best))
+            GAP
+            + v[:, None] * self.headway[:, None]
+            + v[:, None] * (v[:, None] - pace) / (2 * np.sqrt(ACCELERATION * BRAKING))
         )
-        follow = a[:, None] - top * (np.maximum(spacing, 0.5) / gap) ** 2
+        follow = a[:, None] - ACCELERATION * (np.maximum(spacing, 0.5) / gap) ** 2
         # A body across the corridor is no leader to follow; brake for it once that is needed.
         need = v[:, None] ** 2 / (2 * np.maximum(gap - BODY_GAP, 0.1))
         cross = np.where((need > 3.0) | (gap < BODY_GAP + 0.5), -np.maximum(need, 1.0), np.inf)
@@ -236,32 +271,38 @@ class IntersectionRoad(RegulatedRoad):
         need = v**2 / (2 * np.maximum(room, 0.1))
         brake = (need > 2.0) | (room < 1.0)
         a = np.where(brake, np.minimum(a, -np.maximum(need, 0.5)), a)
-        self.acceleration = np.clip(a, -RouteVehicle.ACC_MAX, RouteVehicle.ACC_MAX)
+        self.acceleration = np.clip(a, -ACC_MAX, ACC_MAX)
 
     def _leaders(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """For N vehicles and M bodies: gap [N, M] m (inf if not ahead), the body's speed along the
         route [N, M], and whether it drives along it."""
-        pose, speed = self.pose, self.speed
+        body = self.table.body
+        index = np.clip(np.rint(self.s / BODY_STEP).astype(int), 0, body.shape[2] - 1)
+        mine = self.route[:, None]
+        other = (self.route - mine // 4 * 4) % 16  # seen from the arm of each
+        offset, aligned = np.moveaxis(body[mine % 4, other, index], -1, 0)
+        where, speed = offset + self.s, self.speed
+        np.fill_diagonal(where, np.inf)
         if self.ego is not None:
-            ego = self.ego
-            pose = np.concatenate([pose, [[*ego.position, ego.heading]]])
-            speed = np.append(speed, ego.speed)
-        cos, sin = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
-        points = np.stack(
-            [pose[:, 0, None] + cos * _BODY[:, 0] - sin * _BODY[:, 1],
-             pose[:, 1, None] + sin * _BODY[:, 0] + cos * _BODY[:, 1]], -1,
-        )  # fmt: skip
-        where, lateral = self.table.project(
-            self.route[:, None], np.broadcast_to(points, (len(self.s), *points.shape))
-        )
-        ahead = (np.abs(lateral) < CORRIDOR) & (where > self.s[:, None, None] + 1.0)
-        gap = np.where(ahead, where, np.inf).min(-1) - self.s[:, None] - LENGTH / 2
-        index = np.arange(len(self.s))
-        gap[index, index] = np.inf
-        near = np.where(np.isfinite(gap), gap + LENGTH / 2, 0.0) + self.s[:, None]
-        heading = self.table.pose(self.route[:, None], near)[..., 2]
-        aligned = np.cos(pose[:, 2] - heading)
+            first, turn = self._ego_ahead(self.ego)
+            where = np.concatenate([where, first[:, None]], 1)
+            aligned = np.concatenate([aligned, turn[:, None]], 1)
+            speed = np.append(speed, self.ego.speed)
+        gap = np.where(where > self.s[:, None] + 1.0, where - self.s[:, None] - LENGTH / 2, np.inf)
         return gap, speed * aligned, aligned > 0.5
+
+    def _ego_ahead(self, ego: EgoVehicle) -> tuple[np.ndarray, np.ndarray]:
+        """Where the ego's body begins in the corridor ahead of each vehicle [N] (arc length, m, or
+        inf), and the cosine of its angle to the route there [N]."""
+        cos, sin = np.cos(ego.heading), np.sin(ego.heading)
+        points = ego.position + BODY @ np.array([[cos, sin], [-sin, cos]])
+        at, lateral = self.table.project(
+            self.route, np.broadcast_to(points, (len(self.s), *points.shape))
+        )
+        ahead = (np.abs(lateral) < CORRIDOR) & (at > self.s[:, None] + 1.0)
+        first = np.where(ahead, at, np.inf).min(1)
+        near = np.where(np.isfinite(first), first, self.s)
+        return first, np.cos(ego.heading - self.table.pose(self.route, near)[..., 2])
 
     def step(self, dt: float) -> None:
         """Move every vehicle by ``dt`` seconds; who passes the end of an exit arm is removed."""
@@ -282,6 +323,6 @@ class IntersectionRoad(RegulatedRoad):
         keep = ~gone
         self.traffic = [v for v, kept in zip(self.traffic, keep, strict=True) if kept]
         self.vehicles = ([self.ego] if self.ego is not None else []) + self.traffic
-        for name in ("route", "s", "speed", "desired", "acceleration", "held", "stop", "pose"):
+        for name in (*_ARRAYS, "pose"):
             setattr(self, name, getattr(self, name)[keep])
         self.entered = np.append(self.entered[:-1][keep], self.entered[-1])

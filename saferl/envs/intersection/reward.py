@@ -56,20 +56,18 @@ class Reward:
     def reference(self, ego: Tensor, route: Tensor) -> Tensor:
         """r_ref [...] of the state ``ego`` [..., 6] on ``route`` [...]."""
         nearest, _, _ = project(ego[..., None, :2], reference_lines(route, ego))
-        error = torch.stack(
-            [
-                ego[..., None, 0] - nearest[..., 0],
-                ego[..., None, 1] - nearest[..., 1],
-                (ego[..., None, 2] - self.speed).expand(nearest.shape[:-1]),
-                ego[..., None, 3].expand(nearest.shape[:-1]),
-                wrap(ego[..., None, 4] - nearest[..., 2]),
-                ego[..., None, 5].expand(nearest.shape[:-1]),
-            ],
-            -1,
+        x, y, v_x, v_y, phi, omega = ego[..., None, :].unbind(-1)
+        metre, speed = (100.0, 20.0) if self.reading == "normalised" else (1.0, 1.0)
+        error = (
+            (x - nearest[..., 0]) / metre,
+            (y - nearest[..., 1]) / metre,
+            (v_x - self.speed) / speed,
+            v_y / speed,
+            wrap(phi - nearest[..., 2]),
+            omega,
         )
-        if self.reading == "normalised":
-            error = error / error.new_tensor([100.0, 100.0, 20.0, 20.0, 1.0, 1.0])
-        per_line = (error.square() * error.new_tensor(self.weights)).sum(-1)
+        per_line = sum(w * e.square() for w, e in zip(self.weights, error, strict=True))
+        assert isinstance(per_line, Tensor)
         return per_line.amin(-1) if self.reading == "normalised" else per_line.amax(-1)
 
     def terms(
@@ -89,8 +87,10 @@ class Reward:
         near = torch.where(d_veh <= 0.2, -3.0 * (1.0 - d_veh), -(1.0 - d_veh))
         terms = {
             "reference": 2.0 / (1.0 + self.reference(ego, route)),
-            "action": -(control.square() * control.new_tensor(self.energy)).sum(-1)
-            - (change * control.new_tensor(self.smoothness)).sum(-1),
+            "action": -sum(
+                self.energy[k] * control[..., k].square() + self.smoothness[k] * change[..., k]
+                for k in range(2)
+            ),
             "destination": -(d_des / self.destination_scale).square(),
             "collision": self.collision * collided.to(ego.dtype),
             "arrival": self.arrival * success.to(ego.dtype),

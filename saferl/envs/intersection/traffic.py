@@ -1,155 +1,276 @@
-"""The vehicles on the road: the ego, the surrounding vehicles, and how these are drawn."""
+"""Surrounding traffic as one batch of tensors: yielding, IDM, motion along routes.
+
+The rules are those of :class:`~saferl.envs.intersection.regulation.IntersectionRoad`, which states
+them and applies them to highway-env's vehicles. Here the N vehicles of any number of scenes come
+first, [N, ...], pairs are [N, T, ...], and T = N + 1 counts the ego too, last: the scenes lie side by
+side in memory, where vector units find them.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import NamedTuple
 
-import numpy as np
 import torch
-from highway_env.road.road import Road
-from highway_env.vehicle.behavior import IDMVehicle
-from highway_env.vehicle.kinematics import Vehicle
 from torch import Tensor
 
-from saferl.envs.intersection.dynamics import step_ego
-from saferl.envs.intersection.geometry import ARM, LENGTH, ROUTES, WIDTH
-from saferl.envs.intersection.network import Routes
+from saferl.envs.intersection.geometry import ARM, LENGTH, WIDTH, Frame, frame, frames_overlap
+from saferl.envs.intersection.network import BODY, CORRIDOR
+from saferl.envs.intersection.roads import Lanes, bodies, lane_frames, lane_project
 
-SPEEDS = (6.0, 10.0)  # m/s, drawn at reset
-SPAWN_LENGTH = 95.0  # m along the approach
-GAP = 15.0  # m between surrounding vehicles at reset (paper)
-EGO_GAP = 20.0  # m to the ego at reset (ours)
-
-#: Weight of each route when a surrounding vehicle is drawn, [ego's route][arm][left, straight
-#: inner, straight outer, right], arms from the ego's one clockwise (ours). The more a route crosses
-#: or joins the ego's, the likelier it is; every route keeps a positive weight.
-_WEIGHTS = {
-    "lt": [[1, 1, 1, 1], [2, 3, 3, 1], [1, 3, 3, 1], [2, 2, 2, 1]],
-    "gs_inner": [[1, 1, 1, 1], [2, 2, 2, 1], [2, 1, 1, 1], [2, 2, 2, 1]],
-    "gs_outer": [[1, 1, 1, 1], [2, 2, 2, 1], [2, 1, 1, 1], [2, 2, 2, 1]],
-    "rt": [[1, 1, 3, 3], [1, 1, 30, 1], [1, 1, 1, 1], [1, 1, 1, 1]],
-}
-ROUTE_WEIGHTS = np.array([_WEIGHTS[name] for name in ROUTES], dtype=np.float64).reshape(-1, 16)
-
-
-class RouteVehicle(IDMVehicle):
-    """A surrounding vehicle: highway-env's IDM vehicle on a route, without lane changes.
-
-    :class:`~saferl.envs.intersection.regulation.IntersectionRoad` decides and moves all of them at
-    once, exactly along their routes, so ``act`` and ``step`` of a single one do nothing.
-
-    Args:
-        road: the road it drives on.
-        route_id: its row in :class:`~saferl.envs.intersection.network.Routes`.
-        s: arc length of its centre along the route, m.
-        speed: m/s; also the speed that it wants.
-    """
-
-    LENGTH, WIDTH = LENGTH, WIDTH
-    COMFORT_ACC_MAX = 3.0  # m/s^2
-    COMFORT_ACC_MIN = -5.0
-    ACC_MAX = 6.0
-    DISTANCE_WANTED = 3.0 + LENGTH  # m, centre to centre
-    TIME_WANTED = 1.2  # s
-    YIELDING_COLOR = (255, 170, 60)
-
-    def __init__(self, road: Road, route_id: int, s: float, speed: float, table: Routes):
-        # Without a road the base class does not search every lane for the closest one.
-        nowhere: Any = None
-        super().__init__(nowhere, [0.0, 0.0], speed=speed, enable_lane_change=False, timer=0.0)
-        self.road, self.table, self.route_id = road, table, int(route_id)
-        self.route = list(table.lanes[route_id])
-        self.desired_speed = float(speed)
-        self.is_yielding = False
-        self.lane_index = None
-        self.follow(s, speed, 0.0, table.pose(route_id, s))
-
-    def follow(self, s: float, speed: float, acceleration: float, pose: np.ndarray) -> None:
-        """Take the place at arc length ``s`` with ``pose`` [3]; keeps lane and route up to date."""
-        self.s, self.speed = float(s), float(speed)
-        self.position = pose[:2]
-        self.heading = float(pose[2])
-        self.action = {"steering": 0.0, "acceleration": float(acceleration)}
-        segment = 0 if s <= ARM else 1 if s <= self.table.out[self.route_id] else 2
-        index = self.table.lanes[self.route_id][segment]
-        if index != self.lane_index:
-            self.lane_index = self.target_lane_index = index
-            self.lane = self.road.network.get_lane(index)
-            self.route = list(self.table.lanes[self.route_id][segment:])
-
-    @property
-    def color(self) -> tuple[int, int, int] | None:
-        """Orange while it waits for others, otherwise highway-env's own colour."""
-        return self.YIELDING_COLOR if self.is_yielding else None
-
-    def act(self, action=None) -> None:
-        """Nothing: the road decides for all vehicles at once."""
-
-    def step(self, dt: float) -> None:
-        """Nothing: the road moves all vehicles at once."""
-
-    def predict_trajectory_constant_speed(self, times) -> tuple[np.ndarray, np.ndarray]:
-        """Positions [T, 2] and headings [T] along the route at constant speed."""
-        pose = self.table.pose(self.route_id, self.s + self.speed * np.asarray(times))
-        return pose[:, :2], pose[:, 2]
+PERIOD = 0.2  # s between two decisions of the traffic, at any policy frequency
+TIMES = tuple(0.25 * k for k in range(1, 9))  # s, of the prediction: 2 s (paper)
+STRETCH = 1.5  # predicted rectangles are 1.5 times as long, as in highway-env
+GO_SPEED = 4.0  # m/s, least speed at which a vehicle predicts its own crossing
+COMMIT = 5.0  # m/s^2; a vehicle that could not stop with it before the box has entered
+STOP = ARM - LENGTH / 2 - 1.0  # m, where a yielding vehicle's centre stops
+TIME_MARGIN = 0.5 / 1.2  # s a second of headway, kept from others in the zone where routes cross
+BODY_GAP = 3.0  # m kept from a body across the corridor
+EGO_ROOM = 2.0  # m more for the ego, which keeps to no line
+ACCELERATION, BRAKING = 3.0, 5.0  # m/s^2, comfortable (IDM)
+ACC_MAX = 6.0  # m/s^2
+DELTA = 4.0  # exponent (IDM, as in highway-env)
+GAP = 3.0  # m, bumper to bumper at rest (IDM)
+_LANES = 8  # approach lanes: so many vehicles at most are the first on theirs
 
 
-class EgoVehicle(Vehicle):
-    """The ego: a highway-env vehicle that moves by the dynamic bicycle (E5_1b).
+class Vehicles(NamedTuple):
+    """Surrounding vehicles, each [N, ...] unless said otherwise.
 
     Attributes:
-        state: [6] float64, x, y, v_x, v_y, phi, omega; ``position``, ``heading`` and ``speed``
-            follow it.
-        control: [2] float64, a_x (m/s^2) and delta_f (rad), held over the substeps.
-        route: row in :data:`~saferl.envs.intersection.geometry.ROUTES`.
+        present: bool. route: int64 in [0, 16).
+        s, speed, desired: arc length of the centre (m), speed and wanted speed (m/s).
+        headway: s. heedless: ignores road priority, bool.
+        entered: [T, ...] time at which a vehicle entered the box, s, or inf.
+        held: waits at the entry line, bool. stop: arc length where it must stop, m, or inf.
     """
 
-    LENGTH, WIDTH = LENGTH, WIDTH
-    COLOR = (50, 200, 0)
-
-    def __init__(self, road: Road, state: Tensor, route: int):
-        nowhere: Any = None
-        super().__init__(nowhere, [0.0, 0.0])
-        self.road, self.route_id = road, int(route)
-        self.color = self.COLOR
-        self.control = torch.zeros(2, dtype=torch.float64)
-        self.place(state)
-
-    def place(self, state: Tensor) -> None:
-        """Take ``state`` [6]."""
-        self.state = state.to(torch.float64)
-        x, y, v_x, v_y, phi, self.omega = self.state.tolist()
-        self.position = np.array([x, y])
-        self.heading, self.speed = phi, float(np.hypot(v_x, v_y))
-
-    def act(self, action: Tensor | None = None) -> None:
-        """Hold a control [2] in physical units; without one keep the last."""
-        if action is not None:
-            self.control = action.to(torch.float64)
-            acceleration, steering = self.control.tolist()
-            self.action = {"acceleration": acceleration, "steering": steering}
-
-    def step(self, dt: float) -> None:
-        """Integrate E5_1b for ``dt`` seconds."""
-        self.place(step_ego(self.state, self.control, dt))
+    present: Tensor
+    route: Tensor
+    s: Tensor
+    speed: Tensor
+    desired: Tensor
+    headway: Tensor
+    heedless: Tensor
+    entered: Tensor
+    held: Tensor
+    stop: Tensor
 
 
-def draw_traffic(
-    rng: np.random.Generator, table: Routes, count: int, ego: EgoVehicle
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Draw surrounding vehicles: route [N] int, arc length [N] m, speed [N] m/s, N <= ``count``.
+def vehicle_states(vehicles: Vehicles, lane: Lanes) -> Tensor:
+    """States [..., N, 6]: x, y, v_x, 0, phi, omega."""
+    place, heading = lane_frames(lane, vehicles.s)
+    bends = (vehicles.s > ARM) & (vehicles.s < lane.out)
+    omega = torch.where(bends, vehicles.speed * lane.curvature, 0.0)
+    states = (place.x, place.y, vehicles.speed, torch.zeros_like(omega), heading, omega)
+    return torch.stack(states).movedim((0, 1), (-1, -2))
 
-    ``count`` vehicles are drawn; one closer than 15 m to an earlier one (paper) or 20 m to the ego
-    (ours) is removed.
+
+def _and(values: Tensor, ego: Tensor) -> Tensor:
+    """Values of the vehicles [N, ...] and of the ego [...]: [T, ...]."""
+    return torch.cat([values, ego[None]])
+
+
+def road_rules(
+    vehicles: Vehicles,
+    lane: Lanes,
+    own: Lanes,
+    zone: tuple[Tensor, Tensor],
+    ego: Tensor,
+    time: Tensor,
+) -> Vehicles:
+    """Decide who waits at the line or brakes in the box; gives new ``entered``, ``held``, ``stop``.
+
+    Args:
+        vehicles: each [N, ...].
+        lane, own: their lanes and the ego's.
+        zone: begin and end of where each can be hit by the others and the ego, [N, T, ...].
+        ego: state [..., 6].
+        time: since the start of the episode [...], s.
     """
-    weight = ROUTE_WEIGHTS[ego.route_id]
-    route = rng.choice(16, size=count, p=weight / weight.sum())
-    s = rng.uniform(0.0, SPAWN_LENGTH, size=count)
-    speed = rng.uniform(*SPEEDS, size=count)
-    position = table.pose(route, s)[:, :2]
-    keep: list[int] = []
-    for k in range(count):
-        near = np.hypot(*(position[keep] - position[k]).T) < GAP
-        if np.hypot(*(position[k] - ego.position)) >= EGO_GAP and not near.any():
-            keep.append(k)
-    return route[keep], s[keep], speed[keep]
+    s, speed, count = vehicles.s, vehicles.speed, len(vehicles.s)
+    ego_s, _ = lane_project(own, ego[..., 0], ego[..., 1])
+    turned = ego[..., 4] - lane_frames(own, ego_s)[1]
+    ego_pace = (torch.hypot(ego[..., 2], ego[..., 3]) * torch.cos(turned)).clamp_min(0.0)
+
+    all_s, all_speed = _and(s, ego_s), _and(speed, ego_pace)
+    yes = torch.ones_like(ego_s, dtype=torch.bool)
+    there = _and(vehicles.present, yes)
+    present = there & (all_s < _and(lane.out, own.out) + LENGTH / 2)  # not yet out of the box
+    to_line = ARM - LENGTH / 2 - all_s
+    unable = ~_and(vehicles.held, ~yes) & (all_speed.square() > 2 * COMMIT * (to_line - 0.5))
+    inside = present & ((to_line < 0) | unable)
+    entered = torch.where(inside, torch.minimum(vehicles.entered, time), torch.inf)
+
+    # Rank: order of entry, then road priority, then time to the line; ties by distance and number.
+    arrival = to_line.clamp_min(0.0) / all_speed.clamp_min(1.0)
+    right_of_way = _and(lane.priority, own.priority) * 100.0 - arrival
+    rank = torch.where(inside, 1000.0 - entered.clamp_max(600.0), right_of_way)
+    number = torch.arange(count + 1, device=s.device).reshape(-1, *[1] * ego_s.ndim)
+    mine, their = (slice(0, count), None), (None,)  # i and j of pairs [N, T, ...]
+    farther = all_s[their] > all_s[mine]
+    tie = farther | ((all_s[their] == all_s[mine]) & (number[their] < number[mine]))
+    above = (rank[their] > rank[mine]) | ((rank[their] == rank[mine]) & tie)
+
+    approach = _and(lane.approach, own.approach)
+    same = approach[their] == approach[mine]
+    waiting = present & ~inside
+    first = waiting[:count] & ~(same & waiting[their] & farther).any(1)
+
+    pace = speed.clamp_min(GO_SPEED)
+    meet = _meet(lane, s, pace, own, ego_s, ego_pace, ego) & ~same & there[their]
+    clash = _clash(vehicles, pace, zone[0][:, :count], zone[1][:, :count])
+
+    blocked = (clash & inside[None, :count]).any(1)
+    gives_way = torch.cat([meet[:, :count] | clash, meet[:, count:]], 1) & above
+    held = _held(first, vehicles.heedless, blocked, gives_way, present[count:])
+
+    # Two that have entered and are bound for the same zone: the later one brakes before it.
+    begin = zone[0]
+    within = s[:, None] >= begin
+    wait = clash & (within[:, :count].transpose(0, 1) | above[:, :count])
+    wait = torch.cat([wait, (meet & above)[:, count:]], 1)
+    wait = wait & ~within & inside[mine] & inside[their]
+    room = torch.cat([begin[:, :count], begin[:, count:] - EGO_ROOM], 1)
+    stop = torch.where(wait, room - 0.5, torch.inf).amin(1)
+    return vehicles._replace(entered=entered, held=held, stop=torch.where(held, STOP, stop))
+
+
+def _held(
+    first: Tensor, heedless: Tensor, blocked: Tensor, gives_way: Tensor, ego_free: Tensor
+) -> Tensor:
+    """Who waits: a vehicle yields to those above it that do not wait themselves, bool [N, ...].
+
+    ``gives_way`` [N, T, ...] follows a total order, so as many rounds as there are approach lanes
+    settle it, from any start.
+    """
+    yields = first & ~heedless
+    blocked = blocked | (gives_way[:, -1:] & ego_free).any(1)
+    gives_way = gives_way[:, :-1]
+    held = yields & blocked
+    for _ in range(_LANES):
+        held = yields & (blocked | (gives_way & (first & ~held)[None]).any(1))
+    return held
+
+
+def _meet(
+    lane: Lanes, s: Tensor, pace: Tensor, own: Lanes, ego_s: Tensor, ego_pace: Tensor, ego: Tensor
+) -> Tensor:
+    """[N, T, ...]: do the rectangles of i and j meet within 2 s, both along their routes at constant
+    speed? The ego keeps its distance and angle to its route."""
+    times = torch.tensor(TIMES, dtype=s.dtype, device=s.device).reshape(-1, *[1] * s.ndim)
+    path, _ = lane_frames(lane, s + pace * times)  # [times, N, ...]
+    size = (STRETCH * LENGTH, WIDTH)
+    pairs = frames_overlap(
+        path.at((slice(None), slice(None), None)), path.at((slice(None), None)), size, size
+    )
+
+    here, heading = lane_frames(own, ego_s)
+    lateral = (ego[..., 1] - here.y) * here.cos - (ego[..., 0] - here.x) * here.sin
+    turned = ego[..., 4] - heading
+    c, sn = torch.cos(turned), torch.sin(turned)
+    x, y, cos, sin = lane_frames(own, ego_s + ego_pace * times[:, 0])[0]
+    beside = Frame(x - lateral * sin, y + lateral * cos, cos * c - sin * sn, sin * c + cos * sn)
+    hit = frames_overlap(path, beside.at((slice(None), None)), size, size)
+    return torch.cat([pairs.any(0), hit.any(0)[:, None]], 1)
+
+
+def _clash(vehicles: Vehicles, pace: Tensor, begin: Tensor, end: Tensor) -> Tensor:
+    """[N, N, ...]: would vehicle i, at ``pace`` [N, ...] m/s, meet j in the zone of their routes, which
+    lies at arc lengths ``begin`` to ``end`` [N, N, ...] of i's route?"""
+    s, their_s = vehicles.s[:, None], vehicles.s[None]
+    pace, slow = pace[:, None], vehicles.speed.clamp_min(0.5)[None]
+    margin = TIME_MARGIN * vehicles.headway[:, None]
+    their_begin, their_end = begin.transpose(0, 1), end.transpose(0, 1)
+    return (
+        torch.isfinite(begin)
+        & (s < end)
+        & (their_s < their_end)
+        & vehicles.present[None]
+        & ((begin - s) / pace < (their_end - their_s) / slow + margin)
+        & ((their_begin - their_s).clamp_min(0.0) / slow < (end - s) / pace + margin)
+    )
+
+
+def accelerate(vehicles: Vehicles, lane: Lanes, ego: Tensor) -> Tensor:
+    """Accelerations [N, ...], m/s^2: IDM behind whatever is in the corridor, braking before stops.
+
+    Args:
+        vehicles: each [N, ...].
+        lane: their lanes.
+        ego: state [..., 6].
+    """
+    s, v = vehicles.s, vehicles.speed
+    # Slow down in time for the box, keep its speed limit, and speed up after it.
+    limit = torch.sqrt(lane.turn_speed.square() + 2 * 2.0 * (ARM - s).clamp_min(0.0))
+    limit = torch.where(s > lane.out, torch.inf, limit)
+    share = (v / torch.minimum(vehicles.desired, limit)).square()
+    free = ACCELERATION * (1 - share.square())
+
+    where, aligned = bodies(vehicles.route, s)
+    other = ~torch.eye(len(s), dtype=torch.bool, device=s.device).reshape(
+        *where.shape[:2], *[1] * (s.ndim - 1)
+    )
+    where = torch.where(vehicles.present[None] & other, where, torch.inf)
+    ego_where, ego_aligned = _ego_ahead(s, lane, ego)
+    a = torch.minimum(
+        _follow(vehicles, free, where, v[None] * aligned, aligned).amin(1),
+        _follow(
+            vehicles,
+            free,
+            ego_where[:, None],
+            (torch.hypot(ego[..., 2], ego[..., 3]) * ego_aligned)[:, None],
+            ego_aligned[:, None],
+        ).squeeze(1),
+    )
+    a = torch.minimum(free, a)
+    room = vehicles.stop - s
+    need = v.square() / (2 * room.clamp_min(0.1))
+    a = torch.where((need > 2.0) | (room < 1.0), torch.minimum(a, -need.clamp_min(0.5)), a)
+    return a.clamp(-ACC_MAX, ACC_MAX)
+
+
+def _follow(
+    vehicles: Vehicles, free: Tensor, where: Tensor, pace: Tensor, aligned: Tensor
+) -> Tensor:
+    """Acceleration [N, M, ...] that each of M bodies allows; inf where it is none of i's business.
+
+    Args:
+        free: acceleration without them [N, ...].
+        where: arc length on i's route at which a body begins, m or inf.
+        pace: its speed along the route, m/s.
+        aligned: cosine of the angle between the two.
+    """
+    s, v = vehicles.s[:, None], vehicles.speed[:, None]
+    gap = torch.where(where > s + 1.0, where - s - LENGTH / 2, torch.inf).clamp_min(0.1)
+    wanted = (
+        GAP + v * vehicles.headway[:, None] + v * (v - pace) / (2 * (ACCELERATION * BRAKING) ** 0.5)
+    )
+    follow = free[:, None] - ACCELERATION * (wanted.clamp_min(0.5) / gap).square()
+    # A body across the corridor is no leader to follow; brake for it once that is needed.
+    need = v.square() / (2 * (gap - BODY_GAP).clamp_min(0.1))
+    across = torch.where((need > 3.0) | (gap < BODY_GAP + 0.5), -need.clamp_min(1.0), torch.inf)
+    return torch.where(aligned > 0.5, follow, across)
+
+
+def _ego_ahead(s: Tensor, lane: Lanes, ego: Tensor) -> tuple[Tensor, Tensor]:
+    """Arc length on the routes [N, ...] at which the ego's body begins (m; inf where it is not in the
+    corridor ahead), and the cosine of its angle to the route there."""
+    centre = frame(ego[..., 0], ego[..., 1], ego[..., 4])
+    body = torch.tensor(BODY, dtype=ego.dtype, device=ego.device).reshape(
+        -1, 2, 1, *[1] * (s.ndim - 1)
+    )
+    x = centre.x + centre.cos * body[:, 0] - centre.sin * body[:, 1]
+    y = centre.y + centre.sin * body[:, 0] + centre.cos * body[:, 1]
+    at, lateral = lane_project(lane, x, y)  # [6, N, ...]
+    ahead = (lateral.abs() < CORRIDOR) & (at > s + 1.0)
+    at = torch.where(ahead, at, torch.inf).amin(0)
+    near, _ = lane_frames(lane, torch.where(torch.isfinite(at), at, s))
+    return at, centre.cos * near.cos + centre.sin * near.sin
+
+
+def move(vehicles: Vehicles, lane: Lanes, acceleration: Tensor, dt: float) -> Vehicles:
+    """Vehicles after ``dt`` seconds; who passes the end of an exit arm is gone."""
+    speed = (vehicles.speed + acceleration * dt).clamp_min(0.0)
+    s = vehicles.s + (vehicles.speed + speed) / 2 * dt
+    present = vehicles.present & (s + LENGTH / 2 <= lane.out + ARM)
+    return vehicles._replace(s=s, speed=speed, present=present)
