@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import logging
-import warnings
-from functools import partial
+from collections.abc import Callable
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from saferl.envs.intersection.base import STANDING, SUBSTEPS, IntersectionBase, Scenario
+from saferl.envs.intersection.base import (
+    OUTCOMES,
+    STANDING,
+    SUBSTEPS,
+    IntersectionBase,
+    Scenario,
+)
 from saferl.envs.intersection.dynamics import step_ego, to_physical
-from saferl.envs.intersection.geometry import arrived, frame, frames_overlap, offroad
+from saferl.envs.intersection.geometry import arrived, columns, frame, offroad, separation
 from saferl.envs.intersection.observation import observe
-from saferl.envs.intersection.roads import Lanes, lane_frames, lanes, zones
+from saferl.envs.intersection.roads import Lanes, lane_frames, lanes, pairs, zones
 from saferl.envs.intersection.spawning import (
     Drawn,
     draw_route,
@@ -59,6 +64,7 @@ def _roads(vehicles: Vehicles, ego_route: Tensor) -> State:
         **_named(_OWN, lanes(ego_route, like)),
         "zone_begin": begin.movedim(-1, 0),
         "zone_end": end.movedim(-1, 0),
+        "pair": pairs(route).movedim(-1, 0),
     }
 
 
@@ -83,25 +89,31 @@ def begin(scenario: Scenario, seed: Tensor) -> State:
     route = draw_route(scenario.task, seed)
     ego = draw_start(route, seed, scenario.route_starts)
     vehicles = _drivers(draw_traffic(scenario.traffic, route, ego, seed))
-    return {
+    state = {
         "seed": seed, "route": route, "ego": ego.float(),
         "steps": torch.zeros_like(seed), "still": torch.zeros_like(seed),
-        "control": torch.zeros(len(seed), 2, device=seed.device),
-        "observed": torch.zeros_like(vehicles.present).movedim(-1, 0),
+        "control": columns(torch.zeros_like(ego[:, 0]), torch.zeros_like(ego[:, 0])).float(),
         **_named(_VEHICLE, vehicles), **_roads(vehicles, route),
     }  # fmt: skip
+    return state | look(scenario, state)[0]
 
 
-def restart(scenario: Scenario, state: State, seed: Tensor, reset: Tensor) -> tuple[State, State]:
-    """Begin new episodes where ``reset`` [B]; returns all states, and what is observed in them."""
-    state = scenes_last(
-        {
-            key: torch.where(reset.reshape(-1, *[1] * (value.ndim - 1)), value, state[key])
-            for key, value in begin(scenario, seed).items()
-        }
-    )
-    observation, _, observed = look(scenario, state)
-    return state | {"observed": observed}, observation
+def restart(scenario: Scenario, state: State, seed: Tensor, reset: Tensor, rows: Tensor) -> State:
+    """Begin new episodes in those of the environments ``rows`` [K] that are in ``reset`` [B].
+
+    Args:
+        state: each [B, ...].
+        seed: of the new episodes [B], int64.
+        rows: different indices; K may be the same at every call, however many environments reset.
+    """
+    fresh = begin(scenario, seed[rows])
+    mask = reset[rows]
+
+    def merge(old: Tensor, new: Tensor) -> Tensor:
+        new = torch.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old[rows])
+        return old.index_copy(0, rows, new)
+
+    return {key: merge(old, fresh[key]) for key, old in state.items()}
 
 
 def _respawn(scenario: Scenario, vehicles: Vehicles, state: State) -> Vehicles:
@@ -119,26 +131,25 @@ def _respawn(scenario: Scenario, vehicles: Vehicles, state: State) -> Vehicles:
     return Vehicles(*merged)
 
 
-def look(scenario: Scenario, state: State) -> tuple[State, Tensor, Tensor]:
-    """What is observed in a state.
+def look(scenario: Scenario, state: State) -> tuple[State, Tensor]:
+    """What is seen in a state.
 
     Returns:
-        ``ego`` [B, 9] and ``vehicles`` [B, M, 6] as they are sensed; ``ego`` as it is; and which
-        vehicles are within view [B, N].
+        ``seen_ego`` [B, 9] and ``seen_vehicles`` [B, M, 6], the observation as it is sensed, and
+        ``within_view`` [B, N], which vehicles are truly observable; and the true ``ego`` [B, 9].
     """
     vehicles = vehicles_of(state)
     others = vehicle_states(vehicles, _lanes(state, _LANE))
-    scene, route, rows = state["ego"], state["route"], scenario.rows
-    own, table, observed = observe(scene, others, state[_VEHICLE + "present"], route, rows)
-    observation = {"ego": own, "vehicles": table, "route": route}
+    ego, route, rows = state["ego"], state["route"], scenario.rows
+    present = state[_VEHICLE + "present"]
+    own, table, within_view = observe(ego, others, present, route, rows)
+    seen = own, table
     if not scenario.traffic.sensed_exactly:
-        present, slot = (
-            state[_VEHICLE + "present"],
-            torch.arange(len(vehicles.s), device=others.device),
-        )
+        slot = torch.arange(len(vehicles.s), device=others.device)
         sensed = sense(scenario.traffic, others, present, slot, state["seed"], state["steps"])
-        observation["ego"], observation["vehicles"], _ = observe(scene, *sensed, route, rows)
-    return observation, own, observed
+        seen = observe(ego, *sensed, route, rows)
+    view = {"seen_ego": seen[0], "seen_vehicles": seen[1], "within_view": within_view}
+    return view, own
 
 
 def advance(scenario: Scenario, state: State, action: Tensor) -> tuple[State, State]:
@@ -150,29 +161,31 @@ def advance(scenario: Scenario, state: State, action: Tensor) -> tuple[State, St
         action: [B, 2] in [-1, 1].
 
     Returns:
-        The next state, and the observation, outcomes, ``reward``, ``cost`` and ends.
+        The next state; and outcomes, ``reward``, ``cost`` and ends, each [B].
     """
     control = to_physical(action)
     ego, route, steps, vehicles = state["ego"], state["route"], state["steps"], vehicles_of(state)
     previous = torch.where(steps[:, None] == 0, control, state["control"])
-    lane, own = _lanes(state, _LANE), _lanes(state, _OWN)
+    lane, own_lane = _lanes(state, _LANE), _lanes(state, _OWN)
+    pair = state["pair"].movedim(0, -1)
     zone = state["zone_begin"].movedim(0, -1), state["zone_end"].movedim(0, -1)
-    cost = scenario.cost(ego, control, vehicle_states(vehicles, lane), state["observed"])
+    cost = scenario.cost(ego, control, vehicle_states(vehicles, lane), state["within_view"])
 
     time = steps.to(ego.dtype) / scenario.policy_frequency
     due = steps % scenario.rules_every == 0
     traffic = scenario.traffic.vehicles[1] > 0
     if traffic:
-        vehicles = _choose(due, road_rules(vehicles, lane, own, zone, ego, time), vehicles)
+        vehicles = _choose(due, road_rules(vehicles, lane, own_lane, zone, ego, time), vehicles)
     collision = torch.zeros_like(due)
     for _ in range(SUBSTEPS):  # a collision ends a decision at once
         if traffic:
-            moved = move(vehicles, lane, accelerate(vehicles, lane, ego), scenario.dt)
+            moved = move(vehicles, lane, accelerate(vehicles, lane, pair, ego), scenario.dt)
             vehicles = _choose(collision, vehicles, moved)
         ego = torch.where(collision[:, None], ego, step_ego(ego, control, scenario.dt))
-        place, _ = lane_frames(lane, vehicles.s)
-        hit = frames_overlap(frame(ego[:, 0], ego[:, 1], ego[:, 4]), place)
-        collision = collision | (hit & vehicles.present).any(0)
+        if traffic:
+            place, _ = lane_frames(lane, vehicles.s)
+            gap = separation(frame(ego[:, 0], ego[:, 1], ego[:, 4]), place)
+            collision = collision | (torch.where(vehicles.present, gap, torch.inf).amin(0) <= 0)
     after = state | {
         "ego": ego,
         "control": control,
@@ -183,26 +196,31 @@ def advance(scenario: Scenario, state: State, action: Tensor) -> tuple[State, St
         vehicles = _respawn(scenario, vehicles, state)
         after |= _roads(vehicles, route)
     after |= _named(_VEHICLE, vehicles)
-    observation, true, observed = look(scenario, after)
+    seen, own = look(scenario, after)
+    after |= seen
     off = offroad(ego)
     success = arrived(ego, route) & ~off & ~collision
     reward = scenario.reward(
-        ego,
-        route,
-        control,
-        previous,
-        true[:, 7],
-        true[:, 8],
-        observed.any(-1),
-        off | collision,
-        success,
-    )
+        ego, route, control, previous, own[:, 7], own[:, 8], seen["within_view"].any(-1),
+        off | collision, success,
+    )  # fmt: skip
     terminated = off | collision | success
     truncated = (after["steps"] >= scenario.horizon) | (after["still"] >= scenario.patience)
-    return after | {"observed": observed}, observation | {
+    return after, {
         "collision": collision, "offroad": off, "success": success, "reward": reward, "cost": cost,
         "terminated": terminated, "truncated": truncated, "done": terminated | truncated,
     }  # fmt: skip
+
+
+def _compiled(function: Callable) -> Callable:
+    """Compiled with static shapes, the numbers of a scenario among its constants."""
+    compiled = torch.compile(function, fullgraph=True, dynamic=False)
+
+    def run(*args):
+        with torch._dynamo.config.patch(specialize_float=True):
+            return compiled(*args)
+
+    return run
 
 
 class BatchedIntersection(IntersectionBase):
@@ -230,28 +248,34 @@ class BatchedIntersection(IntersectionBase):
         compile_physics: bool = False,
     ):
         super().__init__(scenario, num_envs, seed, device)
-        self._restart, self._advance = partial(restart, scenario), partial(advance, scenario)
         if compile_physics:
             log.info(
-                "Compiling the simulation at its first step: about half a minute, less the next time."
+                "Compiling the simulation at its first step: about a minute, a few seconds the next time."
             )
-            warnings.filterwarnings("ignore", category=UserWarning, module="torch._inductor")
-            settings = {"fullgraph": True, "dynamic": False}
-            self._restart = partial(torch.compile(restart, **settings), scenario)
-            self._advance = partial(torch.compile(advance, **settings), scenario)
+        self._advance = _compiled(advance) if compile_physics else advance
+        # So many environments are reset at a time that a step in which a few episodes end is not
+        # charged for all of them.
+        self._chunk = max(min(num_envs, 32), num_envs // 8)
         self._state: State = {}
+
+    def _observation(self) -> State:
+        seen = {"ego": "seen_ego", "vehicles": "seen_vehicles", "route": "route"}
+        return {key: self._state[name] for key, name in seen.items()}
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
         reset = self._reset_mask(tensordict)
         seeds = self._next_seeds(tensordict, reset)
-        state = self._state or begin(self.scenario, seeds)
-        self._state, observation = self._restart(state, seeds, reset)
+        if not self._state:
+            self._state = scenes_last(begin(self.scenario, seeds))
+        order = reset.to(torch.int8).argsort(descending=True, stable=True)
+        for rows in order.split(self._chunk)[: -(-int(reset.sum()) // self._chunk)]:
+            self._state = restart(self.scenario, self._state, seeds, reset, rows)
         no = torch.zeros_like(reset)
-        return self._output(observation | {"collision": no, "offroad": no, "success": no})
+        return self._output(self._observation() | dict.fromkeys(OUTCOMES, no))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self._state, output = self._advance(self._state, tensordict["action"])
-        return self._output(output)
+        self._state, output = self._advance(self.scenario, self._state, tensordict["action"])
+        return self._output(self._observation() | output)
 
     def snapshot(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         state = {key: value[index] for key, value in self._state.items()}

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from saferl.envs.intersection.dynamics import predict_vehicles, step_ego
-from saferl.envs.intersection.geometry import frame, frames_overlap
+from saferl.envs.intersection.geometry import frame, separation
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,8 @@ class CollisionCost:
             *predict_vehicles(vehicles.movedim(-2, 0), self.dt, self.steps)
         )  # [T, N, ...]
         beta = beta.reshape(-1, *[1] * speed.ndim)
-        hits = frames_overlap(own.at((slice(None), None)), others, scale=beta[:, None])
+        gap = separation(own.at((slice(None), None)), others, scale=beta[:, None])  # [T, N, ...]
         observed = observed.movedim(-1, 0)
-        count = (hits & observed).sum(1)  # [T, ...]
-        total = (self.initial / self.base_speed * torch.exp(-self.decay * beta) * count).sum(0)
+        price = (self.initial / self.base_speed) * torch.exp(-self.decay * beta)
+        total = torch.where((gap <= 0) & observed, price[:, None], 0.0).sum((0, 1))
         return total * speed / observed.sum(0).clamp_min(1)

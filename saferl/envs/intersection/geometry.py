@@ -237,23 +237,33 @@ def frame(x: Tensor, y: Tensor, heading: Tensor) -> Frame:
     return Frame(x, y, torch.cos(heading), torch.sin(heading))
 
 
-def frames_overlap(
+def separation(
     a: Frame,
     b: Frame,
     size_a: tuple[float, float] = (LENGTH, WIDTH),
     size_b: tuple[float, float] = (LENGTH, WIDTH),
     scale: Tensor | float = 1.0,
 ) -> Tensor:
-    """:func:`overlap` of rectangles at frames [...], broadcast against each other."""
+    """How far apart two rectangles are along the axis that separates them best, m; <= 0: they overlap.
+
+    A number rather than a yes or no: minima of numbers over many pairs are quicker than ``any``.
+
+    Args:
+        a, b: frames [...], broadcast against each other.
+        size_a, size_b: (length, width) in metres.
+        scale: enlarges both rectangles, broadcast against the frames.
+    """
     dx, dy = b.x - a.x, b.y - a.y
     cos, sin = (a.cos * b.cos + a.sin * b.sin).abs(), (a.sin * b.cos - a.cos * b.sin).abs()
     (la, wa), (lb, wb) = ([side * scale / 2 for side in size] for size in (size_a, size_b))
 
     def apart(c, s, l0, w0, l1, w1) -> Tensor:
         along, across = (dx * c + dy * s).abs(), (dy * c - dx * s).abs()
-        return (along > l0 + l1 * cos + w1 * sin) | (across > w0 + l1 * sin + w1 * cos)
+        return torch.maximum(
+            along - (l0 + l1 * cos + w1 * sin), across - (w0 + l1 * sin + w1 * cos)
+        )
 
-    return ~(apart(a.cos, a.sin, la, wa, lb, wb) | apart(b.cos, b.sin, lb, wb, la, wa))
+    return torch.maximum(apart(a.cos, a.sin, la, wa, lb, wb), apart(b.cos, b.sin, lb, wb, la, wa))
 
 
 def overlap(
@@ -274,7 +284,7 @@ def overlap(
         bool [...].
     """
     a, b = (frame(*pose.unbind(-1)) for pose in (pose_a, pose_b))
-    return frames_overlap(a, b, size_a, size_b, scale)
+    return separation(a, b, size_a, size_b, scale) <= 0
 
 
 def on_pavement(points: Tensor) -> Tensor:

@@ -40,7 +40,6 @@ from saferl.envs.intersection.traffic import (
 )
 from saferl.envs.intersection.vehicles import EgoVehicle, RouteVehicle
 
-
 _ARRAYS = {
     "slot": int, "route": int, "s": float, "speed": float, "desired": float, "headway": float,
     "heedless": bool, "acceleration": float, "held": bool, "stop": float,

@@ -104,19 +104,24 @@ def lane_project(lane: Lanes, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     return s, torch.where(past, right, torch.where(inside, off, lateral))
 
 
-def bodies(route: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-    """What vehicles put into each other's corridors: [N, N, ...] from route and s [N, ...].
+def pairs(route: Tensor) -> Tensor:
+    """Where :func:`bodies` finds pairs of vehicles with ``route`` [N, ...]: int64 [N, N, ...]."""
+    mine = route[:, None]
+    other = (route[None] - mine // 4 * 4) % 16  # seen from i's arm
+    return (mine % 4 * 16 + other) * _ROADS.tensors[2].shape[2]
+
+
+def bodies(pair: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+    """What vehicles put into each other's corridors: [N, N, ...] from their pairs and s [N, ...].
 
     Returns:
         Arc length on i's route at which vehicle j's body begins (m, inf where it is not in the
         corridor), and the cosine of the angle between j's direction and the route's there.
     """
     table = _ROADS.like(s)[2]
-    index = (s / BODY_STEP).round().long().clamp(0, table.shape[2] - 1)[None]
-    mine = route[:, None]
-    other = (route[None] - mine // 4 * 4) % 16  # seen from i's arm
-    offset, aligned = table[..., 0], table[..., 1]
-    return offset[mine % 4, other, index] + s[None], aligned[mine % 4, other, index]
+    place = pair + (s / BODY_STEP).round().long().clamp(0, table.shape[2] - 1)
+    offset, aligned = table.flatten(0, 2).movedim(1, 0)
+    return offset[place] + s, aligned[place]
 
 
 def zones(route: Tensor, other: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from saferl.envs.intersection.geometry import ARM, LENGTH, WIDTH, Frame, frame, frames_overlap
+from saferl.envs.intersection.geometry import ARM, LENGTH, WIDTH, Frame, frame, separation
 from saferl.envs.intersection.network import BODY, CORRIDOR
 from saferl.envs.intersection.roads import Lanes, bodies, lane_frames, lane_project
 
@@ -145,10 +145,14 @@ def _held(
     """
     yields = first & ~heedless
     blocked = blocked | (gives_way[:, -1:] & ego_free).any(1)
-    gives_way = gives_way[:, :-1]
+    gives_way, yes = (
+        gives_way[:, :-1].float(),
+        first.float(),
+    )  # numbers are quicker than truth values
     held = yields & blocked
     for _ in range(_LANES):
-        held = yields & (blocked | (gives_way & (first & ~held)[None]).any(1))
+        free = torch.where(held, 0.0, yes)
+        held = yields & (blocked | ((gives_way * free[None]).amax(1) > 0))
     return held
 
 
@@ -160,7 +164,7 @@ def _meet(
     times = torch.tensor(TIMES, dtype=s.dtype, device=s.device).reshape(-1, *[1] * s.ndim)
     path, _ = lane_frames(lane, s + pace * times)  # [times, N, ...]
     size = (STRETCH * LENGTH, WIDTH)
-    pairs = frames_overlap(
+    gap = separation(
         path.at((slice(None), slice(None), None)), path.at((slice(None), None)), size, size
     )
 
@@ -170,8 +174,8 @@ def _meet(
     c, sn = torch.cos(turned), torch.sin(turned)
     x, y, cos, sin = lane_frames(own, ego_s + ego_pace * times[:, 0])[0]
     beside = Frame(x - lateral * sin, y + lateral * cos, cos * c - sin * sn, sin * c + cos * sn)
-    hit = frames_overlap(path, beside.at((slice(None), None)), size, size)
-    return torch.cat([pairs.any(0), hit.any(0)[:, None]], 1)
+    ego_gap = separation(path, beside.at((slice(None), None)), size, size)
+    return torch.cat([gap.amin(0), ego_gap.amin(0)[:, None]], 1) <= 0
 
 
 def _clash(vehicles: Vehicles, pace: Tensor, begin: Tensor, end: Tensor) -> Tensor:
@@ -191,12 +195,13 @@ def _clash(vehicles: Vehicles, pace: Tensor, begin: Tensor, end: Tensor) -> Tens
     )
 
 
-def accelerate(vehicles: Vehicles, lane: Lanes, ego: Tensor) -> Tensor:
+def accelerate(vehicles: Vehicles, lane: Lanes, pair: Tensor, ego: Tensor) -> Tensor:
     """Accelerations [N, ...], m/s^2: IDM behind whatever is in the corridor, braking before stops.
 
     Args:
         vehicles: each [N, ...].
         lane: their lanes.
+        pair: of their routes, see :func:`pairs`.
         ego: state [..., 6].
     """
     s, v = vehicles.s, vehicles.speed
@@ -206,7 +211,7 @@ def accelerate(vehicles: Vehicles, lane: Lanes, ego: Tensor) -> Tensor:
     share = (v / torch.minimum(vehicles.desired, limit)).square()
     free = ACCELERATION * (1 - share.square())
 
-    where, aligned = bodies(vehicles.route, s)
+    where, aligned = bodies(pair, s)
     other = ~torch.eye(len(s), dtype=torch.bool, device=s.device).reshape(
         *where.shape[:2], *[1] * (s.ndim - 1)
     )

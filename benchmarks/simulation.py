@@ -1,0 +1,129 @@
+"""Decisions per second of the batched intersection beside highway-env's own, in one process.
+
+    python benchmarks/simulation.py [--batches 1 256 1024 4096] [--device cpu] [--rounds 5]
+        [--seconds 3] [--clock wall] [--json PATH]
+
+A decision is whole on both sides: yielding, three substeps, observation, reward, and resets; ours
+adds the cost. Stock ``intersection-v1`` runs at 15 Hz with 5 decisions per second and 10 vehicles,
+ours the nominal traffic with 10 vehicles, both with random actions; every environment is stepped by
+``step_and_maybe_reset``, TorchRL's overhead included. The rounds alternate, so that a changing load
+meets all alike. Prints medians, their ratios to stock, the time to the first step, and the memory of
+the states. On a machine that is busy with other work ``--clock cpu`` counts this process's own time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import gymnasium
+import highway_env  # noqa: F401  (registers intersection-v1)
+import torch
+
+from saferl.envs.intersection import BatchedIntersection, Scenario
+
+CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
+
+
+def stock() -> Callable[[], int]:
+    config = {"simulation_frequency": 15, "policy_frequency": 5, "initial_vehicle_count": 10}
+    env = gymnasium.make("intersection-v1", config=config)
+    env.action_space.seed(0)
+    env.reset(seed=0)
+
+    def decide() -> int:
+        _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        if terminated or truncated:
+            env.reset()
+        return 1
+
+    return decide
+
+
+class Ours:
+    """One batched environment and what is known of it."""
+
+    def __init__(self, batch: int, compiled: bool, device: str):
+        self.name = f"B={batch} {'compiled' if compiled else 'eager'}"
+        begin = time.perf_counter()
+        scenario = Scenario(task="mixed")
+        self.env = BatchedIntersection(scenario, batch, device=device, compile_physics=compiled)
+        self.batch, self.device = batch, device
+        self.generator = torch.Generator(device).manual_seed(0)
+        self.data = self.env.reset()
+        self()
+        self.first_step = time.perf_counter() - begin
+        state = self.env.state_dict().values()
+        self.megabytes = sum(t.numel() * t.element_size() for t in state) / 2**20
+
+    def __call__(self) -> int:
+        noise = torch.rand(self.batch, 2, generator=self.generator, device=self.device)
+        self.data["action"] = 2 * noise - 1
+        _, self.data = self.env.step_and_maybe_reset(self.data)
+        return self.batch
+
+
+def rate(decide: Callable[[], int], seconds: float, clock: str, device: str) -> float:
+    now, count = CLOCKS[clock], 0
+    begin = now()
+    while now() - begin < seconds or count == 0:
+        count += decide()
+    if device == "cuda":
+        torch.cuda.synchronize()
+    return count / (now() - begin)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--batches", type=int, nargs="+", default=[1, 256, 1024, 4096])
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--seconds", type=float, default=3.0, help="of each in a round")
+    parser.add_argument("--clock", choices=list(CLOCKS), default="wall")
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+
+    ours = [
+        Ours(batch, compiled, options.device)
+        for batch in options.batches
+        for compiled in (False, True)
+    ]
+    sides: dict[str, Callable[[], int]] = {"stock": stock(), **{one.name: one for one in ours}}
+    rates: dict[str, list[float]] = {name: [] for name in sides}
+    for _ in range(options.rounds):
+        for name, decide in sides.items():
+            rates[name].append(rate(decide, options.seconds, options.clock, options.device))
+    medians = {name: statistics.median(values) for name, values in rates.items()}
+
+    print(f"load {os.getloadavg()[0]:.1f}, {options.clock} clock, {options.rounds} rounds")
+    print(f"{'':16s}{'decisions/s':>12s}{'ratio':>8s}{'us each':>9s}{'first step':>12s}{'state':>9s}")
+    print(f"{'stock':16s}{medians['stock']:12.1f}{1.0:8.1f}{1e6 / medians['stock']:9.1f}")
+    result = {"stock": medians["stock"], "clock": options.clock, "rounds": rates}
+    for one in ours:
+        speed = medians[one.name]
+        ratio = speed / medians["stock"]
+        print(
+            f"{one.name:16s}{speed:12.0f}{ratio:8.0f}{1e6 / speed:9.1f}{one.first_step:10.1f} s"
+            f"{one.megabytes:6.1f} MB"
+        )
+        result[one.name] = {
+            "decisions_per_second": speed,
+            "ratio": ratio,
+            "first_step_s": one.first_step,
+            "state_MB": one.megabytes,
+        }
+    if options.device == "cuda":
+        print(f"{torch.cuda.get_device_name()}: peak {torch.cuda.max_memory_allocated() / 2**20:.0f} MB")
+    if options.json:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        options.json.write_text(json.dumps(result, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()
