@@ -8,6 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from saferl import evaluation
 from saferl.envs.intersection import BatchedIntersection, Scenario
 from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver
 from saferl.envs.intersection.geometry import ROUTES
@@ -105,28 +106,49 @@ def test_cautious_batches_give_what_singles_give():
     assert torch.allclose(shaped.reshape(4, 2), expected, atol=1e-6)
 
 
-def test_random_driver_has_a_generator_of_its_own():
-    first, second, other = RandomDriver(seed=1), RandomDriver(seed=1), RandomDriver(seed=2)
+def views(count):
+    """Observations [count] of an ego that is everywhere else a little further on."""
+    tensordict = torch.cat([view()] * count)
+    tensordict["ego"][:, 2] -= 0.01 * torch.arange(count)
+    return tensordict
+
+
+def test_random_actions_are_of_the_seed_and_of_what_is_seen():
+    batch = views(5)
+    action = RandomDriver(seed=1)(batch.clone())["action"]
+    assert len(action.unique(dim=0)) == 5
+    alone = [RandomDriver(seed=1)(batch[i : i + 1])["action"] for i in range(5)]
+    assert torch.equal(torch.cat(alone), action)
+    assert torch.equal(RandomDriver(seed=1)(batch.flip(0))["action"].flip(0), action)
+    assert not torch.isclose(RandomDriver(seed=2)(views(5))["action"], action).any()
+    batch["ego"] *= 1 + 1e-7  # the last bits are no part of it
+    assert torch.equal(RandomDriver(seed=1)(batch)["action"], action)
+
+
+def test_random_driver_draws_from_no_generator():
     state = torch.get_rng_state()
-    drawn = []
-    for _ in range(3):
-        drawn.append(first(view())["action"])
-        assert not torch.equal(drawn[-1], other(view())["action"])
+    RandomDriver()(views(2))
     assert torch.equal(torch.get_rng_state(), state)
-    # Nor does the global generator, or another driver, move its sequence.
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(99)
-        torch.rand(5)
-        again = [second(view())["action"] for _ in range(3)]
-    assert all(torch.equal(a, b) for a, b in zip(drawn, again, strict=True))
-    assert not torch.equal(drawn[0], drawn[1])
+
+
+def test_a_random_episode_is_the_same_alone_and_in_a_batch():
+    scenario = Scenario(task="mixed", vehicles=4)
+    seeds = torch.arange(5)
+    rows = evaluation.episode_rows(
+        evaluation.play(RandomDriver(), BatchedIntersection(scenario, num_envs=5), seeds), seeds
+    )
+    for seed, row in zip(seeds.split(1), rows, strict=True):
+        env = BatchedIntersection(scenario, num_envs=1)
+        (alone,) = evaluation.episode_rows(evaluation.play(RandomDriver(), env, seed), seed)
+        assert alone.pop("route") == row.pop("route")
+        assert alone == pytest.approx(row, rel=1e-5)
 
 
 def test_random_driver_is_uniform_on_the_box():
-    tensordict = torch.cat([view()] * 4000)
-    action = RandomDriver(seed=3)(tensordict)["action"]
-    assert action.shape == (4000, 2)
+    action = RandomDriver(seed=3)(views(4000))["action"]
+    assert action.shape == (4000, 2) and action.dtype == torch.float32
     quantiles = torch.quantile(action, torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0]), dim=0)
     expected = torch.tensor([-1.0, -0.5, 0.0, 0.5, 1.0])[:, None]
     assert (quantiles - expected).abs().max() < 0.06
     assert torch.corrcoef(action.T)[0, 1].abs() < 0.06
+    assert torch.corrcoef(torch.stack([action[1:, 0], action[:-1, 0]]))[0, 1].abs() < 0.06

@@ -15,6 +15,7 @@ from saferl.envs.intersection.geometry import (
     reference_lines,
     wrap,
 )
+from saferl.envs.intersection.spawning import mix, uniform
 
 CRUISE = 9.0  # m/s
 _LATERAL = 4.5  # m/s^2, the most that a driver asks of a bend
@@ -72,11 +73,12 @@ class Driver(TensorDictModuleBase):
 
 
 class CautiousDriver(Driver):
-    """Follows its lane and waits before the box until its way through is predicted to be free.
+    """Follows its lane as fast as is predicted to hit nobody, and creeps or waits meanwhile.
 
     Every choice of speed is played forward along the line for 4 s against the observed vehicles at
     constant velocity, all rectangles enlarged; the fastest choice that hits nobody is taken, and the
-    hardest braking if every one does.
+    hardest braking if every one does. It knows no entry line, and stops inside the box more often than
+    before it.
 
     Args:
         speed: m/s, of the free road.
@@ -124,19 +126,24 @@ def _world_velocity(ego: Tensor) -> Tensor:
 
 
 class RandomDriver(Driver):
-    """Uniform random actions, the floor of every table; a generator of its own.
+    """Uniform random actions, the floor of every table.
+
+    An action is a hash of ``ego`` and of ``seed``, so that an episode is the same alone, in a batch,
+    and when it is played again. What is seen is rounded to 1e-3 first: the last bits of a simulated
+    state may depend on how many are simulated at once.
 
     Args:
-        seed: of the generator.
+        seed: another seed, other actions.
     """
 
     def __init__(self, seed: int = 0):
         super().__init__()
-        self.seed, self._generator = seed, None
+        self.seed = seed
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         ego = tensordict["ego"]
-        if self._generator is None:
-            self._generator = torch.Generator(ego.device).manual_seed(self.seed)
-        action = torch.rand((*ego.shape[:-1], 2), generator=self._generator, device=ego.device)
-        return tensordict.set("action", 2 * action - 1)
+        key = mix(torch.full(ego.shape[:-1], self.seed, dtype=torch.int64, device=ego.device), 0)
+        for number in (ego.double() * 1e3).round().long().unbind(-1):
+            key = mix(key ^ number, 0)
+        action = torch.stack([uniform(key, 0), uniform(key, 1)], -1)
+        return tensordict.set("action", (2 * action - 1).to(ego.dtype))

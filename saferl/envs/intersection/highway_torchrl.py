@@ -88,7 +88,12 @@ class HighwayIntersection(IntersectionBase):
         return self._stack(("ego", "vehicles", "route", *OUTCOMES, *ends))
 
     def snapshot(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        return self.envs[index].snapshot()
+        """States of the ego [6] and of the others [N, 6], float64: row k is vehicle k, NaN while it
+        is not on the road."""
+        ego, there = self.envs[index].snapshot()
+        others = np.full((self.scenario.traffic.vehicles[1], 6), np.nan)
+        others[self.envs[index].road.slot] = there
+        return ego, others
 
     def render(self, index: int) -> np.ndarray | None:
         return self.envs[index].render()

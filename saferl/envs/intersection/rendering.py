@@ -3,12 +3,26 @@
 from __future__ import annotations
 
 import os
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from torch import Tensor
+
+from saferl.envs.intersection.geometry import ARM, CURB_RADIUS, HALF_BOX, LANE_WIDTH
 
 if TYPE_CHECKING:
     from saferl.envs.intersection.regulation import IntersectionRoad
+
+_HALF_ROAD, _END = 2 * LANE_WIDTH, HALF_BOX + ARM
+#: The pavement, as (x, y, width, height) of rectangles, m.
+PAVEMENT = (
+    (-_HALF_ROAD, -_END, 2 * _HALF_ROAD, 2 * _END),
+    (-_END, -_HALF_ROAD, 2 * _END, 2 * _HALF_ROAD),
+    (-HALF_BOX, -HALF_BOX, 2 * HALF_BOX, 2 * HALF_BOX),
+)
+#: Centres (x, y), m, of the circles of grass that round off the corners of the box.
+CURBS = tuple((x, y) for x in (-HALF_BOX, HALF_BOX) for y in (-HALF_BOX, HALF_BOX))
 
 SIZE = 600  # pixels
 VIEW = 55.0  # m shown to either side of the middle of the intersection
@@ -41,22 +55,14 @@ class Renderer:
         import pygame
         from highway_env.road.graphics import LaneGraphics
 
-        from saferl.envs.intersection.geometry import ARM, CURB_RADIUS, HALF_BOX, LANE_WIDTH
-
-        surface, half = self.surface, 2 * LANE_WIDTH
+        surface = self.surface
         surface.fill(_GRASS)
         pix = surface.vec2pix
-        far = HALF_BOX + ARM
-        for (x, y), (w, h) in (
-            ((-half, -far), (2 * half, 2 * far)),
-            ((-far, -half), (2 * far, 2 * half)),
-            ((-HALF_BOX, -HALF_BOX), (2 * HALF_BOX, 2 * HALF_BOX)),
-        ):
-            (left, top), (right, bottom) = pix((x, y)), pix((x + w, y + h))
+        for x, y, width, height in PAVEMENT:
+            (left, top), (right, bottom) = pix((x, y)), pix((x + width, y + height))
             pygame.draw.rect(surface, _ASPHALT, (left, top, right - left, bottom - top))
-        for x in (-HALF_BOX, HALF_BOX):
-            for y in (-HALF_BOX, HALF_BOX):
-                pygame.draw.circle(surface, _GRASS, pix((x, y)), surface.pix(CURB_RADIUS))
+        for centre in CURBS:
+            pygame.draw.circle(surface, _GRASS, pix(centre), surface.pix(CURB_RADIUS))
         for lane in road.network.lanes_list():
             LaneGraphics.display(lane, surface)
         return surface.copy()
@@ -72,3 +78,31 @@ class Renderer:
         for vehicle in road.vehicles:
             VehicleGraphics.display(vehicle, self.surface, offscreen=True)
         return np.ascontiguousarray(np.moveaxis(pygame.surfarray.array3d(self.surface), 0, 1))
+
+
+@lru_cache(maxsize=1)
+def _stage() -> tuple[IntersectionRoad, Renderer]:
+    """A road to put scenes on, and what draws it: the road's lanes take longer than a picture."""
+    from saferl.envs.intersection.regulation import IntersectionRoad  # late: needs highway-env
+
+    return IntersectionRoad(), Renderer()
+
+
+def draw_state(state: dict[str, Tensor]) -> np.ndarray:
+    """The picture [600, 600, 3] uint8 of one environment of the batched intersection.
+
+    Args:
+        state: on the CPU, ``ego`` [6], ``route`` [], and ``vehicle_present``, ``vehicle_route``,
+            ``vehicle_s``, ``vehicle_speed``, ``vehicle_headway``, ``vehicle_heedless`` and
+            ``vehicle_held`` [N]; see :func:`~saferl.envs.intersection.batched.begin`.
+    """
+    from saferl.envs.intersection.spawning import Drawn
+    from saferl.envs.intersection.vehicles import EgoVehicle
+
+    road, renderer = _stage()
+    ego = EgoVehicle(road, state["ego"], int(state["route"]))
+    road.populate(ego, Drawn(*(state["vehicle_" + name] for name in Drawn._fields)))
+    held = state["vehicle_held"][state["vehicle_present"]].tolist()
+    for vehicle, yields in zip(road.traffic, held, strict=True):
+        vehicle.is_yielding = yields
+    return renderer.draw(road)
