@@ -15,7 +15,7 @@ from torchrl.envs.transforms import Transform
 
 from saferl import checkpoint
 from saferl.builders import build_env, build_trainer, load_agent
-from saferl.checkpoint import CONFIG, run_folder
+from saferl.checkpoint import CONFIG, run_config, run_folder
 from saferl.envs.intersection import Scenario
 from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver
 from saferl.evaluation import as_test, write
@@ -103,17 +103,6 @@ def export(cfg: DictConfig) -> None:
     folder = checkpoint.export(Path(cfg.checkpoint), Path(cfg.out))
     size = (folder / checkpoint.EXPORTED).stat().st_size / 2**20
     log.info("%s: %.1f MiB. Test it: python -m saferl.evaluate checkpoint=%s", folder, size, folder)
-
-
-def run_config(path: Path, option: str = "checkpoint") -> DictConfig:
-    """The resolved configuration that a run was trained with.
-
-    Raises:
-        FileNotFoundError: it is not there.
-    """
-    cfg = OmegaConf.load(run_folder(path, option) / CONFIG)
-    assert isinstance(cfg, DictConfig)
-    return cfg
 
 
 def trained_policy(cfg: DictConfig, path: Path) -> tuple[TensorDictModuleBase, list[Transform]]:

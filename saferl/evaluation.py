@@ -18,8 +18,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from saferl.envs.intersection import Scenario
-from saferl.envs.intersection.spawning import episode_seeds
 from saferl.envs.intersection.geometry import ROUTES
+from saferl.envs.intersection.spawning import episode_seeds
 from saferl.metrics import summarise
 
 

@@ -155,12 +155,12 @@ def test_files_return_to_what_they_were(tmp_path: Path):
 def test_another_architecture_names_the_parameter_and_the_way_out(run: Path):
     wide = compose(*SMALL, *EMPTY, "algo=rsac", "encoder.policy.width=24")
     with pytest.raises(ValueError) as refused:
-        load_agent(wide, run, "init")
+        load_agent(wide, run, "checkpoint")
     message = str(refused.value)
     for part in ("actor_network_params", "[16]", "[24]", "more)", "config.yaml", str(run)):
         assert part in message
     with pytest.raises(ValueError, match=r"cost_critic_params.* in the checkpoint and absent here"):
-        load_agent(compose(*SMALL, *EMPTY, "algo=sac"), run, "init")
+        load_agent(compose(*SMALL, *EMPTY, "algo=sac"), run, "checkpoint")
 
 
 def test_fitting_counts_differences():

@@ -9,11 +9,12 @@ from pathlib import Path
 
 import hydra
 import pytest
+import torch
 from omegaconf import OmegaConf
 from small import EMPTY, SMALL, compose
 
-from saferl.builders import build_trainer
-from saferl.checkpoint import CONFIG
+from saferl.builders import build_agent, build_trainer, load_agent
+from saferl.checkpoint import CONFIG, run_config
 from saferl.trainer import _interrupts
 
 TRAIN, TEST, EXPORT = ("train", "config"), ("evaluate", "evaluate"), ("export", "export")
@@ -119,21 +120,46 @@ def test_a_run_is_not_written_over_nor_reconfigured(run: Path, refusal):
     line = refusal(*TRAIN, f"resume={run}", "gamma=0.9", "out=x")
     assert "takes no other option, got gamma=0.9, out=x" in line
     line = refusal(*TRAIN, *SMALL, *EMPTY, f"init={run}", "algo=sac", "encoder.policy.width=24")
-    assert "[16] in the checkpoint and [24] here" in line and "config.yaml" in line
+    assert "do not fit: encoder.policy.width is 16 there and 24 here." in line
     assert "task.rows must be 2" in refusal(*TEST, f"checkpoint={run}")
 
 
-def test_init_begins_from_the_networks(run: Path, tmp_path: Path):
-    trainer = build_trainer(
-        compose(*SMALL, *EMPTY, "algo=sac", "task.rows=2", "seed=9", f"init={run}"), tmp_path
-    )
-    other = build_trainer(compose(*SMALL, *EMPTY, "algo=sac", "task.rows=2"), run)
-    other.resume()
-    ours, theirs = (t.learner.loss.state_dict() for t in (trainer, other))
-    for name in (key for key in ours if hasattr(ours[key], "shape")):
-        # A new run's targets begin as copies of the networks.
-        assert (ours[name] == theirs[name.removeprefix("target_")]).all(), name
+@pytest.mark.parametrize("algo", ["sac", "rsac"])
+def test_init_begins_from_the_networks_alone(algo: str, run: Path, tmp_path: Path):
+    """Of a run without cost critics too; the settings are those of the new configuration."""
+    options = ("gamma=0.5", "cost_limit=0.3", "alpha_init=0.7", "target_entropy=-1")
+    new = compose(*SMALL, *EMPTY, f"algo={algo}", "task.rows=2", "seed=9", *options, f"init={run}")
+    trainer = build_trainer(new, tmp_path)
+    ours = trainer.learner.loss.state_dict()
+    theirs = load_agent(run_config(run), run, "x").loss.state_dict()
+    fresh = build_agent(new).loss.state_dict()
+    for name in (key for key in ours if isinstance(ours[key], torch.Tensor)):
+        if "network_params" in name:  # a new run's targets begin as copies of the networks
+            assert (ours[name] == theirs[name.removeprefix("target_")]).all(), name
+        elif "cost_critic_params" not in name:  # these begin at random
+            assert (ours[name] == fresh[name]).all(), name
+    assert float(ours["log_alpha"].exp()) == pytest.approx(0.7)
+    assert ours["_value_estimator.gamma"] == 0.5
+    assert algo == "sac" or ours["cost_limit"] == pytest.approx(0.3)
     assert trainer.progress.frames == 0 and trainer.collector.init_random_frames == 0
+
+
+def test_init_of_another_algorithm(run: Path, tmp_path: Path, refusal):
+    """SAC begun from a constrained run; an MLP from attention is refused by the options."""
+    constrained = tmp_path / "constrained"
+    cfg = compose(*SMALL, *EMPTY, "algo=rsac", "task.rows=2")
+    build_trainer(cfg, constrained).save()
+    OmegaConf.save(cfg, constrained / CONFIG, resolve=True)
+    trainer = build_trainer(
+        compose(*SMALL, *EMPTY, "algo=sac", "task.rows=2", f"init={constrained}"), tmp_path / "x"
+    )
+    ours, theirs = trainer.learner.loss, load_agent(cfg, constrained, "x").loss
+    assert (ours.actor_network_params == theirs.actor_network_params).all()
+
+    line = refusal(*TRAIN, *SMALL, *EMPTY, f"init={run}", "algo=asac", "task.rows=3")
+    for part in ("algo_name is sac there and asac here", "task.rows is 2 there and 3 here"):
+        assert part in line
+    assert "encoder.policy._target_ is saferl.modules.MLPPolicyEncoder there and" in line
 
 
 def test_train_from_any_folder_then_multirun(command, tmp_path: Path, capsys):

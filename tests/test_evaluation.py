@@ -19,8 +19,8 @@ from saferl.envs.intersection import (
     Reward,
     Scenario,
 )
-from saferl.envs.intersection.spawning import episode_seeds
 from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver
+from saferl.envs.intersection.spawning import episode_seeds
 from saferl.envs.transforms import SafetyProjector
 from saferl.evaluation import as_test, evaluate, write
 from saferl.metrics import FIGURES
