@@ -265,14 +265,12 @@ def latest(run: Path, option: str = "checkpoint") -> Path:
     """
     if not run.exists():
         raise FileNotFoundError(f"{option}: no such file or folder: {run}")
-    for path in (run, run / EXPORTED):
-        if Checkpoint.is_checkpoint(path):
-            return path
     folder = run / FOLDER
-    path = CheckpointRotation(folder, keep_last=1).latest() if folder.is_dir() else None
-    if path is None:
-        raise FileNotFoundError(f"{option}: {run} holds no checkpoint (looked in {folder}).")
-    return path
+    newest = CheckpointRotation(folder, keep_last=1).latest() if folder.is_dir() else None
+    for path in (run, newest, run / EXPORTED):
+        if path is not None and Checkpoint.is_checkpoint(path):
+            return path
+    raise FileNotFoundError(f"{option}: {run} holds no checkpoint (looked in {folder}).")
 
 
 def run_folder(path: Path, option: str = "checkpoint") -> Path:
@@ -337,7 +335,10 @@ def export(path: Path, folder: Path) -> Path:
 
     Raises:
         FileNotFoundError: ``path`` holds no run or no checkpoint.
+        ValueError: ``folder`` holds a run or a policy already.
     """
+    if any((folder / name).exists() for name in (FOLDER, "metrics.csv", EXPORTED)):
+        raise ValueError(f"out: {folder} holds a run or a policy already; take another folder.")
     config = run_config(path)
     checkpoint = Checkpoint(loss=_Held())
     _load(checkpoint, latest(path))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import shutil
 from pathlib import Path
 
 import pytest
@@ -187,6 +188,24 @@ def test_folders(run: Path, tmp_path: Path):
     (tmp_path / "inner").mkdir()
     with pytest.raises(FileNotFoundError, match=r"no config\.yaml"):
         run_folder(tmp_path / "inner")
+
+
+def test_a_run_is_newer_than_a_policy_beside_it(run: Path, tmp_path: Path):
+    shutil.copytree(run, tmp_path / "run")
+    policy = export(run, tmp_path / "policy")
+    shutil.copy(policy / EXPORTED, tmp_path / "run")
+    assert latest(tmp_path / "run").parent == tmp_path / "run/checkpoints"
+
+
+def test_export_destroys_nothing(run: Path, tmp_path: Path):
+    """Neither the run that it reads nor a policy that is there."""
+    before = (run / CONFIG).read_bytes()
+    with pytest.raises(ValueError, match=f"out: {run} holds a run or a policy already"):
+        export(run, run)
+    assert (run / CONFIG).read_bytes() == before and not (run / EXPORTED).exists()
+    policy = export(run, tmp_path / "policy")
+    with pytest.raises(ValueError, match=f"out: {policy} holds a run or a policy already"):
+        export(run, policy)
 
 
 def test_export_holds_the_networks_alone_and_drives_the_same(run: Path, tmp_path: Path):
