@@ -48,7 +48,7 @@ def train(cfg: DictConfig) -> None:
                 "resume continues a run as it was configured and takes no other option, "
                 f"got {', '.join(others)}."
             )
-        run = run_folder(Path(cfg.resume), "resume")
+        run = run_folder(Path(str(cfg.resume)), "resume")
         cfg = run_config(run)
         trainer = build_trainer(cfg, run)
         trainer.resume()
@@ -56,16 +56,21 @@ def train(cfg: DictConfig) -> None:
     trainer.train()
 
     settings = cfg.evaluation
-    measure(
-        cfg,
-        as_test(hydra.utils.instantiate(cfg.task), settings.policy_frequency),
-        *trained_policy(cfg, run),
-        out=run / "evaluation",
-        num_envs=settings.num_envs,
-        episodes=settings.episodes,
-        seed=cfg.seed,
-        policy_name=cfg.algo_name,
-    )
+    try:
+        measure(
+            cfg,
+            as_test(hydra.utils.instantiate(cfg.task), settings.policy_frequency),
+            *trained_policy(cfg, run),
+            out=run / "evaluation",
+            num_envs=settings.num_envs,
+            episodes=settings.episodes,
+            seed=cfg.seed,
+            policy_name=cfg.algo_name,
+        )
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"Interrupted in the closing test. Repeat it with resume={run}"
+        ) from None
 
 
 def evaluate(cfg: DictConfig) -> None:
@@ -100,7 +105,7 @@ def export(cfg: DictConfig) -> None:
     for key in ("checkpoint", "out"):
         if cfg[key] is None:
             raise ValueError(f"{key}=... is missing: give checkpoint=RUN and out=DIR.")
-    folder = checkpoint.export(Path(cfg.checkpoint), Path(cfg.out))
+    folder = checkpoint.export(Path(str(cfg.checkpoint)), Path(str(cfg.out)))
     size = (folder / checkpoint.EXPORTED).stat().st_size / 2**20
     log.info("%s: %.1f MiB. Test it: python -m saferl.evaluate checkpoint=%s", folder, size, folder)
 

@@ -60,7 +60,11 @@ MISTAKES = [
     (TRAIN, "algo=sac loss=sac_lag", "needs cost_critic, got cost_critic=none"),
     (TRAIN, "algo=sac projector=gradient", "projector needs cost critics"),
     (TRAIN, "resume=missing", "resume: no such file or folder: missing"),
+    (TRAIN, "resume=2025", "resume: no such file or folder: 2025"),
     (TRAIN, "init=missing", "init: no such file or folder: missing"),
+    (TRAIN, "out=", "out must be a path, got ''"),
+    (TRAIN, "resume=", "resume must be a path, got ''"),
+    (TRAIN, "init=", "init must be a path, got ''"),
     (
         TEST,
         "",
@@ -73,7 +77,10 @@ MISTAKES = [
     (TEST, "policy=blind episodes=0", "episodes must be a whole number, >= 1, got 0"),
     (TEST, "policy=blind task=foo", "task must be one of gs, lt, mixed, rt, got 'foo'"),
     (TEST, "policy=blind foo=1", "unknown key 'foo'; choose from task, env, checkpoint"),
+    (TEST, "policy=blind out=", "out must be a path, got ''"),
+    (TEST, "checkpoint=", "checkpoint must be a path, got ''"),
     (EXPORT, "", "checkpoint=... is missing"),
+    (EXPORT, "checkpoint=x out=", "out must be a path, got ''"),
     (EXPORT, "checkpoint=missing out=x", "checkpoint: no such file or folder: missing"),
 ]
 
@@ -230,6 +237,20 @@ def test_interrupt_leaves_a_checkpoint_that_loads(spawn, tmp_path: Path):
     trainer.resume()
     assert trainer.progress.updates > 0 and trainer.progress.frames >= 16
     assert len(trainer.buffer) == min(64, trainer.progress.frames)
+
+
+def test_interrupt_of_the_closing_test_tells_how_to_repeat_it(command, monkeypatch, capsys):
+    def interrupted(*args):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit) as left:
+        patch.setattr("saferl.commands.play_episodes", interrupted)
+        command(*TRAIN, *SMALL, *EMPTY, "algo=sac", "out=run")
+    assert left.value.code == 130
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith("Interrupted in the closing test. Repeat it with resume=")
+    command(*TRAIN, line.split()[-1])
+    assert Path("run/evaluation/metrics.json").is_file()
 
 
 def test_second_interrupt_ends_at_once(tmp_path: Path):
