@@ -18,7 +18,7 @@ from saferl.builders import build_env, build_trainer, load_agent
 from saferl.checkpoint import CONFIG, run_config, run_folder
 from saferl.envs.intersection import Scenario
 from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver
-from saferl.evaluation import as_test, write
+from saferl.evaluation import TEST, as_test, write
 from saferl.evaluation import evaluate as play_episodes
 from saferl.metrics import table
 from saferl.paths import pretrained_run
@@ -78,8 +78,8 @@ def evaluate(cfg: DictConfig) -> None:
     check_testing(cfg)
     torch.set_num_threads(cfg.threads)
     OmegaConf.resolve(cfg)
+    cfg, policy, transforms, name = choose_policy(cfg)
     scenario = hydra.utils.instantiate(cfg.task)
-    policy, transforms, name = choose_policy(cfg)
     out = Path(HydraConfig.get().runtime.output_dir)
     rows = measure(
         cfg,
@@ -124,8 +124,34 @@ def trained_policy(cfg: DictConfig, path: Path) -> tuple[TensorDictModuleBase, l
     return agent.actor, [agent.projector]
 
 
-def choose_policy(cfg: DictConfig) -> tuple[TensorDictModuleBase, list[Transform], str]:
-    """The policy that a test names, the transforms that it drives with, and what to call it.
+def on_its_own_task(cfg: DictConfig, trained: DictConfig, overrides: Sequence[str]) -> DictConfig:
+    """A test's configuration with the task and environment that a policy was trained with.
+
+    Args:
+        cfg: the test's configuration as composed.
+        trained: the run's configuration.
+        overrides: the command line; what it says of task and environment stands. Of a choice
+            ``task=lt`` only the name counts.
+    """
+    keys = [override.partition("=")[0].lstrip("+") for override in overrides]
+    test = cfg.copy()
+    OmegaConf.set_struct(test, False)
+    rate = {"policy_frequency": trained.evaluation.policy_frequency}
+    test.task = OmegaConf.merge(trained.task, TEST, rate)
+    if "env" not in keys:
+        test.env = OmegaConf.merge(trained.env, {"num_envs": cfg.env.num_envs})
+    for key in keys:
+        key = "task.task" if key == "task" else key
+        if key.startswith(("task.", "env.")):
+            OmegaConf.update(test, key, OmegaConf.select(cfg, key))
+    return test
+
+
+def choose_policy(
+    cfg: DictConfig,
+) -> tuple[DictConfig, TensorDictModuleBase, list[Transform], str]:
+    """A test's own configuration, the policy that it names, the transforms that this drives with,
+    and what to call it.
 
     Raises:
         ValueError: not exactly one source, an unknown name, or an MLP for other observations.
@@ -143,10 +169,11 @@ def choose_policy(cfg: DictConfig) -> tuple[TensorDictModuleBase, list[Transform
     if source == "policy":
         if name not in DRIVERS:
             raise ValueError(f"policy must be one of {', '.join(DRIVERS)}, got {name!r}.")
-        return DRIVERS[name](**({"seed": cfg.seed} if name == "random" else {})), [], name
+        return cfg, DRIVERS[name](**({"seed": cfg.seed} if name == "random" else {})), [], name
     path = pretrained_run(name) if source == "pretrained" else Path(name)
     trained = run_config(path, source)
     trained.device = cfg.device
+    cfg = on_its_own_task(cfg, trained, HydraConfig.get().overrides.task)
     rows = trained.encoder.policy.get("rows", cfg.task.rows)
     if rows != cfg.task.rows:
         raise ValueError(
@@ -154,7 +181,7 @@ def choose_policy(cfg: DictConfig) -> tuple[TensorDictModuleBase, list[Transform
             f"got {cfg.task.rows}."
         )
     policy, transforms = trained_policy(trained, path)
-    return policy, transforms if cfg.project else [], f"{trained.algo_name} ({name})"
+    return cfg, policy, transforms if cfg.project else [], f"{trained.algo_name} ({name})"
 
 
 def measure(
@@ -182,6 +209,11 @@ def measure(
         task=scenario.task,
         env=backend,
         vehicles=scenario.vehicles,
+        rows=scenario.rows,
+        scenario=scenario.scenario,
+        reading=scenario.reward.reading,
+        policy_frequency=scenario.policy_frequency,
+        project=bool(transforms),
         episodes=episodes,
         seed=seed,
     )

@@ -125,8 +125,8 @@ def test_a_run_is_not_written_over_nor_reconfigured(run: Path, refusal):
     line = refusal(*TRAIN, f"resume={run}", "gamma=0.9", "out=x")
     assert "takes no other option, got gamma=0.9, out=x" in line
     line = refusal(*TRAIN, *SMALL, *EMPTY, f"init={run}", "algo=sac", "encoder.policy.width=24")
-    assert "do not fit: encoder.policy.width is 16 there and 24 here." in line
-    assert "task.rows must be 2" in refusal(*TEST, f"checkpoint={run}")
+    assert "task.rows is 2 there and 11 here, encoder.policy.width is 16 there and 24 here." in line
+    assert "task.rows must be 2" in refusal(*TEST, f"checkpoint={run}", "task.rows=3")
 
 
 @pytest.mark.parametrize("algo", ["sac", "rsac"])
