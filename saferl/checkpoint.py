@@ -326,8 +326,22 @@ class _Held:
         return self.state
 
 
+def progress(path: Path) -> dict[str, int] | None:
+    """Frames and episodes at a checkpoint; None where it does not tell.
+
+    Args:
+        path: a run, a checkpoint in it, or an exported policy.
+    """
+    path, held = latest(path), _Held()
+    if "progress" not in Checkpoint.manifest(path)["components"]:
+        return None
+    _load(Checkpoint(progress=held), path)
+    return {name: held.state[name] for name in ("frames", "episodes")}
+
+
 def export(path: Path, folder: Path) -> Path:
-    """Write what a trained policy needs into a folder: its configuration, and one file of networks.
+    """Write what a trained policy needs into a folder: its configuration, and one file of networks
+    with how long they were trained, by which a projector acts.
 
     Args:
         path: a run, or a checkpoint in it.
@@ -340,7 +354,7 @@ def export(path: Path, folder: Path) -> Path:
     if any((folder / name).exists() for name in (FOLDER, "metrics.csv", EXPORTED)):
         raise ValueError(f"out: {folder} holds a run or a policy already; take another folder.")
     config = run_config(path)
-    checkpoint = Checkpoint(loss=_Held())
+    checkpoint = Checkpoint(loss=_Held(), progress=_Held())
     _load(checkpoint, latest(path))
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint.save(folder / EXPORTED, format="archive")

@@ -22,6 +22,7 @@ from saferl.evaluation import TEST, as_test, write
 from saferl.evaluation import evaluate as play_episodes
 from saferl.metrics import table
 from saferl.paths import pretrained_run
+from saferl.trainer import Budget
 from saferl.validation import check_testing
 
 log = logging.getLogger(__name__)
@@ -120,7 +121,9 @@ def trained_policy(cfg: DictConfig, path: Path) -> tuple[TensorDictModuleBase, l
     agent = load_agent(cfg, path, "checkpoint")
     if agent.projector is None:
         return agent.actor, []
-    agent.projector.set_progress(1.0)
+    counted = checkpoint.progress(path)
+    spent = Budget(cfg.episodes, cfg.frames).spent(**counted) if counted else 1.0
+    agent.projector.set_progress(spent)
     return agent.actor, [agent.projector]
 
 

@@ -211,7 +211,7 @@ def test_export_destroys_nothing(run: Path, tmp_path: Path):
 def test_export_holds_the_networks_alone_and_drives_the_same(run: Path, tmp_path: Path):
     folder = export(run, tmp_path / "shipped" / "gs")
     assert {path.name for path in folder.iterdir()} == {CONFIG, EXPORTED}
-    assert set(Checkpoint.manifest(folder / EXPORTED)["components"]) == {"loss"}
+    assert set(Checkpoint.manifest(folder / EXPORTED)["components"]) == {"loss", "progress"}
     assert str(run) not in (folder / CONFIG).read_text()
 
     cfg = compose(*SMALL, *EMPTY, "algo=rsac")

@@ -9,12 +9,15 @@ from pathlib import Path
 import hydra
 import pytest
 import torch
+from omegaconf import OmegaConf
 from small import EMPTY, SMALL, compose
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 
-from saferl.commands import on_its_own_task
+from saferl.builders import build_trainer
+from saferl.checkpoint import CONFIG, export
+from saferl.commands import on_its_own_task, trained_policy
 from saferl.envs.intersection import (
     BatchedIntersection,
     HighwayIntersection,
@@ -202,6 +205,21 @@ def test_the_command_line_alone_changes_a_runs_own_task():
     given = ("env=highway", "env.num_envs=3")
     cfg = on_its_own_task(compose(*given, config="evaluate"), trained, given)
     assert cfg.env._target_.endswith("HighwayIntersection") and cfg.env.num_envs == 3
+
+
+def test_a_checkpoints_projector_acts_as_it_did_in_training(tmp_path: Path):
+    """Not at all before its start, in an exported policy as in the run."""
+    cfg = compose(*SMALL, *EMPTY, "algo=rsac", "projector.start=0.5")
+    trainer = build_trainer(cfg, tmp_path / "run")
+    trainer.save()
+    OmegaConf.save(cfg, tmp_path / "run" / CONFIG, resolve=True)
+    early = export(tmp_path / "run", tmp_path / "early")
+    assert [bool(t.enabled) for t in trained_policy(cfg, early)[1]] == [False]
+    assert [bool(t.enabled) for t in trained_policy(cfg, tmp_path / "run")[1]] == [False]
+    trainer.train()
+    late = export(tmp_path / "run", tmp_path / "late")
+    assert [bool(t.enabled) for t in trained_policy(cfg, late)[1]] == [True]
+    assert [bool(t.enabled) for t in trained_policy(cfg, tmp_path / "run")[1]] == [True]
 
 
 def test_seeds_do_not_repeat():
