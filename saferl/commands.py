@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from datetime import datetime
 from pathlib import Path
 
 import hydra
@@ -81,7 +82,11 @@ def evaluate(cfg: DictConfig) -> None:
     OmegaConf.resolve(cfg)
     cfg, policy, transforms, name = choose_policy(cfg)
     scenario = hydra.utils.instantiate(cfg.task)
-    out = Path(HydraConfig.get().runtime.output_dir)
+    about = f"{name.partition(' ')[0]}-{scenario.task}-seed{cfg.seed}"
+    folder = f"evaluation/{about}/{datetime.now():%Y-%m-%d_%H-%M-%S-%f}"
+    out = Path(folder if cfg.out is None else str(cfg.out))
+    if (out / "metrics.json").exists():
+        raise ValueError(f"out: {out} holds a test already; take another folder.")
     rows = measure(
         cfg,
         scenario,

@@ -222,5 +222,19 @@ def test_a_checkpoints_projector_acts_as_it_did_in_training(tmp_path: Path):
     assert [bool(t.enabled) for t in trained_policy(cfg, tmp_path / "run")[1]] == [True]
 
 
+def test_tests_do_not_mix(tmp_path: Path, command, refusal):
+    """A folder of its own by default; a given one that holds a test is refused."""
+    arguments = ("evaluate", "evaluate", "policy=blind", *EMPTY, "task=rt", "episodes=1")
+    for _ in range(2):
+        command(*arguments)
+    first, second = (tmp_path / "evaluation/blind-rt-seed0").iterdir()
+    assert {path.name for path in first.iterdir()} == {"metrics.json", "episodes.csv"}
+    before = (second / "metrics.json").read_bytes()
+    line = refusal(*arguments, "seed=3", f"out={second}")
+    assert f"out: {second} holds a test already; take another folder." in line
+    assert (second / "metrics.json").read_bytes() == before
+    assert {path.name for path in tmp_path.iterdir()} == {"evaluation"}
+
+
 def test_seeds_do_not_repeat():
     assert len(set(episode_seeds(0, 500).tolist()) | set(episode_seeds(1, 500).tolist())) == 1000
