@@ -219,6 +219,23 @@ def test_help_lists_groups_and_settings(command, capsys):
     assert "algo: arsac, asac, rsac, sac, sac_lag, sac_rs" in text and "gamma: 0.99" in text
 
 
+def test_the_readmes_everyday_commands_work_in_order(command, tmp_path: Path):
+    """With small budgets on an empty road, but otherwise as they stand there."""
+    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    block = readme.partition("## Everyday commands")[2].split("```")[1]
+    lines = [line.partition("#")[0].split() for line in block.splitlines() if "-m saferl" in line]
+    assert len(lines) == 10
+    small = {"saferl": (*SMALL, *EMPTY), "saferl.evaluate": (*EMPTY, "episodes=1", "gif=0")}
+    for _, _, module, *arguments in lines:
+        name = module.partition(".")[2] or "train"
+        if "--help" in arguments:
+            continue
+        if not any(argument.startswith("resume=") for argument in arguments):
+            arguments += small.get(module, ())
+        command(name, "config" if name == "train" else name, *arguments)
+    assert (tmp_path / "test/metrics.json").is_file() and (tmp_path / "policy").is_dir()
+
+
 def test_interrupt_leaves_a_checkpoint_that_loads(spawn, tmp_path: Path):
     """Ctrl-C once; exit 130 and a line that says how to go on, which then works."""
     options = (*SMALL, *EMPTY, "algo=sac", "frames=1000000", "save_every=1000000", "out=run")
