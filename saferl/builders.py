@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase, RewardScaling, RewardSum, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 from torchrl.objectives import LossModule, SoftUpdate
 
-from saferl.checkpoint import latest, load_component
+from saferl.checkpoint import Fitting, Networks, latest, load_component, run_config
 from saferl.envs.intersection import Scenario
 from saferl.envs.transforms import ExecutedAction, SafetyProjector
 from saferl.hooks import ProjectorProgress
@@ -140,15 +140,45 @@ def build_agent(cfg: DictConfig) -> Agent:
 
 
 def load_agent(cfg: DictConfig, path: Path, name: str) -> Agent:
-    """An agent with the networks of a run or checkpoint; ``name`` is the option that gave it.
+    """The agent of a run or checkpoint as it was; ``name`` is the option that gave it.
 
     Raises:
         FileNotFoundError: there is no checkpoint.
         ValueError: the checkpoint is of another architecture.
     """
     agent = build_agent(cfg)
-    load_component(latest(path, name), agent.loss, "loss")
+    load_component(latest(path, name), Fitting(agent.loss))
     return agent
+
+
+def _architecture(cfg: DictConfig) -> dict[str, Any]:
+    """What decides whether the networks of two configurations fit, by option."""
+    encoder = {f"encoder.policy.{key}": value for key, value in cfg.encoder.policy.items()}
+    encoder.pop("encoder.policy.rows", None)  # it follows task.rows
+    return {"algo_name": cfg.algo_name, "task.rows": cfg.task.rows, **encoder}
+
+
+def begin_from(agent: Agent, cfg: DictConfig, path: Path) -> None:
+    """Give an agent the networks of another run; all else stays as ``cfg`` says.
+
+    Raises:
+        FileNotFoundError: there is no checkpoint.
+        ValueError: another architecture; names the options that differ.
+    """
+    try:
+        load_component(latest(path, "init"), Networks(agent.loss))
+    except ValueError as error:
+        ours, theirs = _architecture(cfg), _architecture(run_config(path, "init"))
+        differing = [
+            f"{key} is {theirs[key]} there and {value} here"
+            for key, value in ours.items()
+            if key in theirs and theirs[key] != value
+        ]
+        if not differing:
+            raise
+        raise ValueError(
+            f"init: the networks of {path} do not fit: {', '.join(differing)}."
+        ) from error
 
 
 def build_optimizer(cfg: DictConfig, loss: LossModule) -> torch.optim.Optimizer:
@@ -202,7 +232,9 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
     torch.set_num_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
     scenario = hydra.utils.instantiate(cfg.task)
-    agent = load_agent(cfg, Path(cfg.init), "init") if cfg.init else build_agent(cfg)
+    agent = build_agent(cfg)
+    if cfg.init:
+        begin_from(agent, cfg, Path(cfg.init))
 
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
     transforms = [sums, agent.projector] if agent.projector else [sums]

@@ -169,6 +169,42 @@ class Fitting:
         self.module.load_state_dict(state)
 
 
+class Networks(Fitting):
+    """A loss that takes from another only the networks that both have.
+
+    What is no network (discount, limits, temperature, multiplier) stays as it is, and so do cost
+    critics that the other one lacks.
+
+    Args:
+        loss: the live loss.
+    """
+
+    NAMES = frozenset(
+        f"{target}{network}_params"
+        for network in ("actor_network", "qvalue_network", "cost_critic")
+        for target in ("", "target_")
+    )
+
+    def __init__(self, loss: torch.nn.Module):
+        super().__init__(loss)
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Load the shared networks.
+
+        Raises:
+            ValueError: as :meth:`Fitting.load_state_dict`.
+        """
+        mine = self.module.state_dict()
+        shared = self.NAMES & {_network(key) for key in mine} & {_network(key) for key in state}
+        kept = {key: value for key, value in mine.items() if _network(key) not in shared}
+        taken = {key: value for key, value in state.items() if _network(key) in shared}
+        super().load_state_dict(kept | taken)
+
+
+def _network(key: str) -> str:
+    return key.partition(".")[0]
+
+
 def _shape(value: Any) -> str:
     if value is None:
         return "absent"
@@ -229,14 +265,12 @@ def latest(run: Path, option: str = "checkpoint") -> Path:
     """
     if not run.exists():
         raise FileNotFoundError(f"{option}: no such file or folder: {run}")
-    for path in (run, run / EXPORTED):
-        if Checkpoint.is_checkpoint(path):
-            return path
     folder = run / FOLDER
-    path = CheckpointRotation(folder, keep_last=1).latest() if folder.is_dir() else None
-    if path is None:
-        raise FileNotFoundError(f"{option}: {run} holds no checkpoint (looked in {folder}).")
-    return path
+    newest = CheckpointRotation(folder, keep_last=1).latest() if folder.is_dir() else None
+    for path in (run, newest, run / EXPORTED):
+        if path is not None and Checkpoint.is_checkpoint(path):
+            return path
+    raise FileNotFoundError(f"{option}: {run} holds no checkpoint (looked in {folder}).")
 
 
 def run_folder(path: Path, option: str = "checkpoint") -> Path:
@@ -258,13 +292,28 @@ def run_folder(path: Path, option: str = "checkpoint") -> Path:
     raise FileNotFoundError(f"{option}: no {CONFIG} in {path}; is it a saferl run?")
 
 
-def load_component(path: Path, module: torch.nn.Module, name: str) -> None:
-    """Load one named component of a checkpoint into a live module.
+def run_config(path: Path, option: str = "checkpoint") -> DictConfig:
+    """The resolved configuration that a run was trained with.
+
+    Args:
+        path: a run's folder, or a checkpoint in it.
+        option: what errors call it.
+
+    Raises:
+        FileNotFoundError: it is not there.
+    """
+    cfg = OmegaConf.load(run_folder(path, option) / CONFIG)
+    assert isinstance(cfg, DictConfig)
+    return cfg
+
+
+def load_component(path: Path, component: Fitting) -> None:
+    """Load one component of a checkpoint into a live module.
 
     Raises:
         ValueError: the parameters do not fit; names the first that differs.
     """
-    _load(Checkpoint().register(name, Fitting(module, name)), path)
+    _load(Checkpoint().register(component.name, component), path)
 
 
 class _Held:
@@ -277,8 +326,22 @@ class _Held:
         return self.state
 
 
+def progress(path: Path) -> dict[str, int] | None:
+    """Frames and episodes at a checkpoint; None where it does not tell.
+
+    Args:
+        path: a run, a checkpoint in it, or an exported policy.
+    """
+    path, held = latest(path), _Held()
+    if "progress" not in Checkpoint.manifest(path)["components"]:
+        return None
+    _load(Checkpoint(progress=held), path)
+    return {name: held.state[name] for name in ("frames", "episodes")}
+
+
 def export(path: Path, folder: Path) -> Path:
-    """Write what a trained policy needs into a folder: its configuration, and one file of networks.
+    """Write what a trained policy needs into a folder: its configuration, and one file of networks
+    with how long they were trained, by which a projector acts.
 
     Args:
         path: a run, or a checkpoint in it.
@@ -286,10 +349,12 @@ def export(path: Path, folder: Path) -> Path:
 
     Raises:
         FileNotFoundError: ``path`` holds no run or no checkpoint.
+        ValueError: ``folder`` holds a run or a policy already.
     """
-    config = OmegaConf.load(run_folder(path) / CONFIG)
-    assert isinstance(config, DictConfig)
-    checkpoint = Checkpoint(loss=_Held())
+    if any((folder / name).exists() for name in (FOLDER, "metrics.csv", EXPORTED)):
+        raise ValueError(f"out: {folder} holds a run or a policy already; take another folder.")
+    config = run_config(path)
+    checkpoint = Checkpoint(loss=_Held(), progress=_Held())
     _load(checkpoint, latest(path))
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint.save(folder / EXPORTED, format="archive")

@@ -18,6 +18,7 @@ from saferl.paths import config_dir
 
 #: What a user can get wrong; any other exception is a fault of ours and keeps its trace.
 MISTAKES = (ValueError, OSError, HydraException, OmegaConfBaseException)
+PATHS = ("out", "checkpoint", "resume", "init")
 INTERRUPTED = 130
 
 
@@ -35,6 +36,9 @@ def launch(command: str, config: str) -> None:
         from saferl import commands  # late: help and most mistakes need no torch
 
         try:
+            for key in PATHS:
+                if cfg.get(key) == "":
+                    raise ValueError(f"{key} must be a path, got ''.")
             getattr(commands, command)(cfg)
         except BaseException as error:
             _drop_if_empty(Path(HydraConfig.get().runtime.output_dir))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from datetime import datetime
 from pathlib import Path
 
 import hydra
@@ -15,13 +16,14 @@ from torchrl.envs.transforms import Transform
 
 from saferl import checkpoint
 from saferl.builders import build_env, build_trainer, load_agent
-from saferl.checkpoint import CONFIG, run_folder
+from saferl.checkpoint import CONFIG, run_config, run_folder
 from saferl.envs.intersection import Scenario
 from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver
-from saferl.evaluation import as_test, write
+from saferl.evaluation import TEST, as_test, write
 from saferl.evaluation import evaluate as play_episodes
 from saferl.metrics import table
 from saferl.paths import pretrained_run
+from saferl.trainer import Budget
 from saferl.validation import check_testing
 
 log = logging.getLogger(__name__)
@@ -48,7 +50,7 @@ def train(cfg: DictConfig) -> None:
                 "resume continues a run as it was configured and takes no other option, "
                 f"got {', '.join(others)}."
             )
-        run = run_folder(Path(cfg.resume), "resume")
+        run = run_folder(Path(str(cfg.resume)), "resume")
         cfg = run_config(run)
         trainer = build_trainer(cfg, run)
         trainer.resume()
@@ -56,16 +58,21 @@ def train(cfg: DictConfig) -> None:
     trainer.train()
 
     settings = cfg.evaluation
-    measure(
-        cfg,
-        as_test(hydra.utils.instantiate(cfg.task), settings.policy_frequency),
-        *trained_policy(cfg, run),
-        out=run / "evaluation",
-        num_envs=settings.num_envs,
-        episodes=settings.episodes,
-        seed=cfg.seed,
-        policy_name=cfg.algo_name,
-    )
+    try:
+        measure(
+            cfg,
+            as_test(hydra.utils.instantiate(cfg.task), settings.policy_frequency),
+            *trained_policy(cfg, run),
+            out=run / "evaluation",
+            num_envs=settings.num_envs,
+            episodes=settings.episodes,
+            seed=cfg.seed,
+            policy_name=cfg.algo_name,
+        )
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"Interrupted in the closing test. Repeat it with resume={run}"
+        ) from None
 
 
 def evaluate(cfg: DictConfig) -> None:
@@ -73,9 +80,13 @@ def evaluate(cfg: DictConfig) -> None:
     check_testing(cfg)
     torch.set_num_threads(cfg.threads)
     OmegaConf.resolve(cfg)
+    cfg, policy, transforms, name = choose_policy(cfg)
     scenario = hydra.utils.instantiate(cfg.task)
-    policy, transforms, name = choose_policy(cfg)
-    out = Path(HydraConfig.get().runtime.output_dir)
+    about = f"{name.partition(' ')[0]}-{scenario.task}-seed{cfg.seed}"
+    folder = f"evaluation/{about}/{datetime.now():%Y-%m-%d_%H-%M-%S-%f}"
+    out = Path(folder if cfg.out is None else str(cfg.out))
+    if (out / "metrics.json").exists():
+        raise ValueError(f"out: {out} holds a test already; take another folder.")
     rows = measure(
         cfg,
         scenario,
@@ -100,20 +111,9 @@ def export(cfg: DictConfig) -> None:
     for key in ("checkpoint", "out"):
         if cfg[key] is None:
             raise ValueError(f"{key}=... is missing: give checkpoint=RUN and out=DIR.")
-    folder = checkpoint.export(Path(cfg.checkpoint), Path(cfg.out))
+    folder = checkpoint.export(Path(str(cfg.checkpoint)), Path(str(cfg.out)))
     size = (folder / checkpoint.EXPORTED).stat().st_size / 2**20
     log.info("%s: %.1f MiB. Test it: python -m saferl.evaluate checkpoint=%s", folder, size, folder)
-
-
-def run_config(path: Path, option: str = "checkpoint") -> DictConfig:
-    """The resolved configuration that a run was trained with.
-
-    Raises:
-        FileNotFoundError: it is not there.
-    """
-    cfg = OmegaConf.load(run_folder(path, option) / CONFIG)
-    assert isinstance(cfg, DictConfig)
-    return cfg
 
 
 def trained_policy(cfg: DictConfig, path: Path) -> tuple[TensorDictModuleBase, list[Transform]]:
@@ -126,12 +126,40 @@ def trained_policy(cfg: DictConfig, path: Path) -> tuple[TensorDictModuleBase, l
     agent = load_agent(cfg, path, "checkpoint")
     if agent.projector is None:
         return agent.actor, []
-    agent.projector.set_progress(1.0)
+    counted = checkpoint.progress(path)
+    spent = Budget(cfg.episodes, cfg.frames).spent(**counted) if counted else 1.0
+    agent.projector.set_progress(spent)
     return agent.actor, [agent.projector]
 
 
-def choose_policy(cfg: DictConfig) -> tuple[TensorDictModuleBase, list[Transform], str]:
-    """The policy that a test names, the transforms that it drives with, and what to call it.
+def on_its_own_task(cfg: DictConfig, trained: DictConfig, overrides: Sequence[str]) -> DictConfig:
+    """A test's configuration with the task and environment that a policy was trained with.
+
+    Args:
+        cfg: the test's configuration as composed.
+        trained: the run's configuration.
+        overrides: the command line; what it says of task and environment stands. Of a choice
+            ``task=lt`` only the name counts.
+    """
+    keys = [override.partition("=")[0].lstrip("+") for override in overrides]
+    test = cfg.copy()
+    OmegaConf.set_struct(test, False)
+    rate = {"policy_frequency": trained.evaluation.policy_frequency}
+    test.task = OmegaConf.merge(trained.task, TEST, rate)
+    if "env" not in keys:
+        test.env = OmegaConf.merge(trained.env, {"num_envs": cfg.env.num_envs})
+    for key in keys:
+        key = "task.task" if key == "task" else key
+        if key.startswith(("task.", "env.")):
+            OmegaConf.update(test, key, OmegaConf.select(cfg, key))
+    return test
+
+
+def choose_policy(
+    cfg: DictConfig,
+) -> tuple[DictConfig, TensorDictModuleBase, list[Transform], str]:
+    """A test's own configuration, the policy that it names, the transforms that this drives with,
+    and what to call it.
 
     Raises:
         ValueError: not exactly one source, an unknown name, or an MLP for other observations.
@@ -149,10 +177,11 @@ def choose_policy(cfg: DictConfig) -> tuple[TensorDictModuleBase, list[Transform
     if source == "policy":
         if name not in DRIVERS:
             raise ValueError(f"policy must be one of {', '.join(DRIVERS)}, got {name!r}.")
-        return DRIVERS[name](**({"seed": cfg.seed} if name == "random" else {})), [], name
+        return cfg, DRIVERS[name](**({"seed": cfg.seed} if name == "random" else {})), [], name
     path = pretrained_run(name) if source == "pretrained" else Path(name)
     trained = run_config(path, source)
     trained.device = cfg.device
+    cfg = on_its_own_task(cfg, trained, HydraConfig.get().overrides.task)
     rows = trained.encoder.policy.get("rows", cfg.task.rows)
     if rows != cfg.task.rows:
         raise ValueError(
@@ -160,7 +189,7 @@ def choose_policy(cfg: DictConfig) -> tuple[TensorDictModuleBase, list[Transform
             f"got {cfg.task.rows}."
         )
     policy, transforms = trained_policy(trained, path)
-    return policy, transforms if cfg.project else [], f"{trained.algo_name} ({name})"
+    return cfg, policy, transforms if cfg.project else [], f"{trained.algo_name} ({name})"
 
 
 def measure(
@@ -188,6 +217,11 @@ def measure(
         task=scenario.task,
         env=backend,
         vehicles=scenario.vehicles,
+        rows=scenario.rows,
+        scenario=scenario.scenario,
+        reading=scenario.reward.reading,
+        policy_frequency=scenario.policy_frequency,
+        project=bool(transforms),
         episodes=episodes,
         seed=seed,
     )

@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -22,21 +23,24 @@ from saferl.envs.intersection.geometry import ROUTES
 from saferl.envs.intersection.spawning import episode_seeds
 from saferl.metrics import summarise
 
+#: What a test changes in the task that a policy was trained on: every start before the box, parked
+#: cars left to themselves, and the reward without r_safe, which is the same for every algorithm.
+TEST: dict[str, Any] = {
+    "route_starts": 0.0,
+    "standstill": None,
+    "reward": {"risk_shaping": False},
+}
+
 
 def as_test(scenario: Scenario, policy_frequency: int = 10) -> Scenario:
-    """The conditions of a test: another rate of decisions, every start before the box, parked cars
-    left to themselves, and the reward without r_safe, which is the same for every algorithm.
+    """The conditions of a test: :data:`TEST`, and another rate of decisions.
 
     >>> as_test(Scenario(route_starts=0.5)).route_starts
     0.0
     """
-    return dataclasses.replace(
-        scenario,
-        policy_frequency=policy_frequency,
-        route_starts=0.0,
-        standstill=None,
-        reward=dataclasses.replace(scenario.reward, risk_shaping=False),
-    )
+    reward = dataclasses.replace(scenario.reward, **TEST["reward"])
+    changes = TEST | {"policy_frequency": policy_frequency, "reward": reward}
+    return dataclasses.replace(scenario, **changes)
 
 
 def start(env: EnvBase, seeds: Tensor) -> TensorDictBase:
@@ -181,7 +185,7 @@ def evaluate(
     return [{"episode": i, **row} for i, row in enumerate(rows[:episodes])]
 
 
-def write(rows: list[dict], out: Path, **about: str | int | float) -> dict:
+def write(rows: list[dict], out: Path, /, **about: str | int | float | None) -> dict:
     """Write ``episodes.csv`` and ``metrics.json`` into a folder; returns the metrics."""
     out.mkdir(parents=True, exist_ok=True)
     with (out / "episodes.csv").open("w", newline="") as file:

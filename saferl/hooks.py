@@ -20,11 +20,32 @@ class CriticSignal:
         self._lagrange.update(losses["constraint_violation"])
 
 
+def episode_budget(
+    cost_limit: float, gamma: float, duration: float, policy_frequency: float
+) -> float:
+    """The mean undiscounted cost b of an episode whose discounted form is ``cost_limit`` d.
+
+    Cost spread evenly over T decisions: d = b (1 - gamma^T) / ((1 - gamma) T).
+
+    Args:
+        cost_limit: d_thres.
+        gamma: discount in [0, 1].
+        duration: of an episode, seconds.
+        policy_frequency: decisions per second.
+
+    >>> round(episode_budget(0.05, gamma=0.99, duration=25.0, policy_frequency=5), 4)
+    0.0874
+    """
+    horizon = duration * policy_frequency
+    weight = horizon if gamma == 1.0 else (1.0 - gamma**horizon) / (1.0 - gamma)
+    return cost_limit * horizon / weight
+
+
 class EpisodeSignal:
     """Dual ascent on the mean undiscounted cost of fresh episodes, each used once.
 
     Args:
-        cost_limit: mean episode cost, undiscounted.
+        cost_limit: mean episode cost, undiscounted; see :func:`episode_budget`.
 
     Raises:
         ValueError: a negative limit.

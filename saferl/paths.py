@@ -10,6 +10,10 @@ from omegaconf import OmegaConf
 OmegaConf.register_new_resolver(
     "first", lambda *values: next(v for v in values if v is not None), replace=True
 )
+# ${when:a,b} is b where a is not null, else null.
+OmegaConf.register_new_resolver(
+    "when", lambda given, value: None if given is None else value, replace=True
+)
 
 PACKAGE = Path(__file__).resolve().parent
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import shutil
 from pathlib import Path
 
 import pytest
@@ -155,12 +156,12 @@ def test_files_return_to_what_they_were(tmp_path: Path):
 def test_another_architecture_names_the_parameter_and_the_way_out(run: Path):
     wide = compose(*SMALL, *EMPTY, "algo=rsac", "encoder.policy.width=24")
     with pytest.raises(ValueError) as refused:
-        load_agent(wide, run, "init")
+        load_agent(wide, run, "checkpoint")
     message = str(refused.value)
     for part in ("actor_network_params", "[16]", "[24]", "more)", "config.yaml", str(run)):
         assert part in message
     with pytest.raises(ValueError, match=r"cost_critic_params.* in the checkpoint and absent here"):
-        load_agent(compose(*SMALL, *EMPTY, "algo=sac"), run, "init")
+        load_agent(compose(*SMALL, *EMPTY, "algo=sac"), run, "checkpoint")
 
 
 def test_fitting_counts_differences():
@@ -189,10 +190,28 @@ def test_folders(run: Path, tmp_path: Path):
         run_folder(tmp_path / "inner")
 
 
+def test_a_run_is_newer_than_a_policy_beside_it(run: Path, tmp_path: Path):
+    shutil.copytree(run, tmp_path / "run")
+    policy = export(run, tmp_path / "policy")
+    shutil.copy(policy / EXPORTED, tmp_path / "run")
+    assert latest(tmp_path / "run").parent == tmp_path / "run/checkpoints"
+
+
+def test_export_destroys_nothing(run: Path, tmp_path: Path):
+    """Neither the run that it reads nor a policy that is there."""
+    before = (run / CONFIG).read_bytes()
+    with pytest.raises(ValueError, match=f"out: {run} holds a run or a policy already"):
+        export(run, run)
+    assert (run / CONFIG).read_bytes() == before and not (run / EXPORTED).exists()
+    policy = export(run, tmp_path / "policy")
+    with pytest.raises(ValueError, match=f"out: {policy} holds a run or a policy already"):
+        export(run, policy)
+
+
 def test_export_holds_the_networks_alone_and_drives_the_same(run: Path, tmp_path: Path):
     folder = export(run, tmp_path / "shipped" / "gs")
     assert {path.name for path in folder.iterdir()} == {CONFIG, EXPORTED}
-    assert set(Checkpoint.manifest(folder / EXPORTED)["components"]) == {"loss"}
+    assert set(Checkpoint.manifest(folder / EXPORTED)["components"]) == {"loss", "progress"}
     assert str(run) not in (folder / CONFIG).read_text()
 
     cfg = compose(*SMALL, *EMPTY, "algo=rsac")

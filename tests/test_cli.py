@@ -9,11 +9,12 @@ from pathlib import Path
 
 import hydra
 import pytest
+import torch
 from omegaconf import OmegaConf
 from small import EMPTY, SMALL, compose
 
-from saferl.builders import build_trainer
-from saferl.checkpoint import CONFIG
+from saferl.builders import build_agent, build_trainer, load_agent
+from saferl.checkpoint import CONFIG, run_config
 from saferl.trainer import _interrupts
 
 TRAIN, TEST, EXPORT = ("train", "config"), ("evaluate", "evaluate"), ("export", "export")
@@ -51,16 +52,19 @@ MISTAKES = [
     (TRAIN, "evaluation.episodes=0", "evaluation.episodes must be a whole number, >= 1, got 0"),
     (TRAIN, "projector.step_size=-1", "step_size must be finite and > 0, got -1"),
     (TRAIN, "task.reward.reading=foo", "reading must be one of normalised, raw, got 'foo'"),
-    (TRAIN, "task.vehicles=abc", "task.vehicles must be a whole number, got 'abc'"),
+    (TRAIN, "task.vehicles=abc", "task.vehicles must be a whole number or null, got 'abc'"),
     (TRAIN, "env.num_envs=abc", "env.num_envs must be a whole number, got 'abc'"),
     (TRAIN, "encoder.policy.heads=3", "width must be a multiple of heads, got 256 and 3"),
     (TRAIN, "lagrange.multiplier.lr=-1", "lr must be finite and > 0, got -1"),
-    (TRAIN, "env=batched", "vehicles must be 0, got 10. Use env=highway"),
     (TRAIN, "loss=sac", "takes no cost_critic: set cost_critic=none, or loss=sac_lag"),
     (TRAIN, "algo=sac loss=sac_lag", "needs cost_critic, got cost_critic=none"),
     (TRAIN, "algo=sac projector=gradient", "projector needs cost critics"),
-    (TRAIN, "resume=missing", "resume: no config.yaml in missing"),
+    (TRAIN, "resume=missing", "resume: no such file or folder: missing"),
+    (TRAIN, "resume=2025", "resume: no such file or folder: 2025"),
     (TRAIN, "init=missing", "init: no such file or folder: missing"),
+    (TRAIN, "out=", "out must be a path, got ''"),
+    (TRAIN, "resume=", "resume must be a path, got ''"),
+    (TRAIN, "init=", "init must be a path, got ''"),
     (
         TEST,
         "",
@@ -73,8 +77,10 @@ MISTAKES = [
     (TEST, "policy=blind episodes=0", "episodes must be a whole number, >= 1, got 0"),
     (TEST, "policy=blind task=foo", "task must be one of gs, lt, mixed, rt, got 'foo'"),
     (TEST, "policy=blind foo=1", "unknown key 'foo'; choose from task, env, checkpoint"),
-    (TEST, "policy=blind env=batched", "vehicles must be 0, got 10"),
+    (TEST, "policy=blind out=", "out must be a path, got ''"),
+    (TEST, "checkpoint=", "checkpoint must be a path, got ''"),
     (EXPORT, "", "checkpoint=... is missing"),
+    (EXPORT, "checkpoint=x out=", "out must be a path, got ''"),
     (EXPORT, "checkpoint=missing out=x", "checkpoint: no such file or folder: missing"),
 ]
 
@@ -119,21 +125,46 @@ def test_a_run_is_not_written_over_nor_reconfigured(run: Path, refusal):
     line = refusal(*TRAIN, f"resume={run}", "gamma=0.9", "out=x")
     assert "takes no other option, got gamma=0.9, out=x" in line
     line = refusal(*TRAIN, *SMALL, *EMPTY, f"init={run}", "algo=sac", "encoder.policy.width=24")
-    assert "[16] in the checkpoint and [24] here" in line and "config.yaml" in line
-    assert "task.rows must be 2" in refusal(*TEST, f"checkpoint={run}")
+    assert "task.rows is 2 there and 11 here, encoder.policy.width is 16 there and 24 here." in line
+    assert "task.rows must be 2" in refusal(*TEST, f"checkpoint={run}", "task.rows=3")
 
 
-def test_init_begins_from_the_networks(run: Path, tmp_path: Path):
-    trainer = build_trainer(
-        compose(*SMALL, *EMPTY, "algo=sac", "task.rows=2", "seed=9", f"init={run}"), tmp_path
-    )
-    other = build_trainer(compose(*SMALL, *EMPTY, "algo=sac", "task.rows=2"), run)
-    other.resume()
-    ours, theirs = (t.learner.loss.state_dict() for t in (trainer, other))
-    for name in (key for key in ours if hasattr(ours[key], "shape")):
-        # A new run's targets begin as copies of the networks.
-        assert (ours[name] == theirs[name.removeprefix("target_")]).all(), name
+@pytest.mark.parametrize("algo", ["sac", "rsac"])
+def test_init_begins_from_the_networks_alone(algo: str, run: Path, tmp_path: Path):
+    """Of a run without cost critics too; the settings are those of the new configuration."""
+    options = ("gamma=0.5", "cost_limit=0.3", "alpha_init=0.7", "target_entropy=-1")
+    new = compose(*SMALL, *EMPTY, f"algo={algo}", "task.rows=2", "seed=9", *options, f"init={run}")
+    trainer = build_trainer(new, tmp_path)
+    ours = trainer.learner.loss.state_dict()
+    theirs = load_agent(run_config(run), run, "x").loss.state_dict()
+    fresh = build_agent(new).loss.state_dict()
+    for name in (key for key in ours if isinstance(ours[key], torch.Tensor)):
+        if "network_params" in name:  # a new run's targets begin as copies of the networks
+            assert (ours[name] == theirs[name.removeprefix("target_")]).all(), name
+        elif "cost_critic_params" not in name:  # these begin at random
+            assert (ours[name] == fresh[name]).all(), name
+    assert float(ours["log_alpha"].exp()) == pytest.approx(0.7)
+    assert ours["_value_estimator.gamma"] == 0.5
+    assert algo == "sac" or ours["cost_limit"] == pytest.approx(0.3)
     assert trainer.progress.frames == 0 and trainer.collector.init_random_frames == 0
+
+
+def test_init_of_another_algorithm(run: Path, tmp_path: Path, refusal):
+    """SAC begun from a constrained run; an MLP from attention is refused by the options."""
+    constrained = tmp_path / "constrained"
+    cfg = compose(*SMALL, *EMPTY, "algo=rsac", "task.rows=2")
+    build_trainer(cfg, constrained).save()
+    OmegaConf.save(cfg, constrained / CONFIG, resolve=True)
+    trainer = build_trainer(
+        compose(*SMALL, *EMPTY, "algo=sac", "task.rows=2", f"init={constrained}"), tmp_path / "x"
+    )
+    ours, theirs = trainer.learner.loss, load_agent(cfg, constrained, "x").loss
+    assert (ours.actor_network_params == theirs.actor_network_params).all()
+
+    line = refusal(*TRAIN, *SMALL, *EMPTY, f"init={run}", "algo=asac", "task.rows=3")
+    for part in ("algo_name is sac there and asac here", "task.rows is 2 there and 3 here"):
+        assert part in line
+    assert "encoder.policy._target_ is saferl.modules.MLPPolicyEncoder there and" in line
 
 
 def test_train_from_any_folder_then_multirun(command, tmp_path: Path, capsys):
@@ -188,6 +219,23 @@ def test_help_lists_groups_and_settings(command, capsys):
     assert "algo: arsac, asac, rsac, sac, sac_lag, sac_rs" in text and "gamma: 0.99" in text
 
 
+def test_the_readmes_everyday_commands_work_in_order(command, tmp_path: Path):
+    """With small budgets on an empty road, but otherwise as they stand there."""
+    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    block = readme.partition("## Everyday commands")[2].split("```")[1]
+    lines = [line.partition("#")[0].split() for line in block.splitlines() if "-m saferl" in line]
+    assert len(lines) == 10
+    small = {"saferl": (*SMALL, *EMPTY), "saferl.evaluate": (*EMPTY, "episodes=1", "gif=0")}
+    for _, _, module, *arguments in lines:
+        name = module.partition(".")[2] or "train"
+        if "--help" in arguments:
+            continue
+        if not any(argument.startswith("resume=") for argument in arguments):
+            arguments += small.get(module, ())
+        command(name, "config" if name == "train" else name, *arguments)
+    assert (tmp_path / "test/metrics.json").is_file() and (tmp_path / "policy").is_dir()
+
+
 def test_interrupt_leaves_a_checkpoint_that_loads(spawn, tmp_path: Path):
     """Ctrl-C once; exit 130 and a line that says how to go on, which then works."""
     options = (*SMALL, *EMPTY, "algo=sac", "frames=1000000", "save_every=1000000", "out=run")
@@ -206,6 +254,20 @@ def test_interrupt_leaves_a_checkpoint_that_loads(spawn, tmp_path: Path):
     trainer.resume()
     assert trainer.progress.updates > 0 and trainer.progress.frames >= 16
     assert len(trainer.buffer) == min(64, trainer.progress.frames)
+
+
+def test_interrupt_of_the_closing_test_tells_how_to_repeat_it(command, monkeypatch, capsys):
+    def interrupted(*args):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit) as left:
+        patch.setattr("saferl.commands.play_episodes", interrupted)
+        command(*TRAIN, *SMALL, *EMPTY, "algo=sac", "out=run")
+    assert left.value.code == 130
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith("Interrupted in the closing test. Repeat it with resume=")
+    command(*TRAIN, line.split()[-1])
+    assert Path("run/evaluation/metrics.json").is_file()
 
 
 def test_second_interrupt_ends_at_once(tmp_path: Path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import hydra
 import pytest
 from omegaconf import OmegaConf
 from small import SMALL, compose
@@ -86,6 +87,25 @@ def test_composition_is_the_papers(algo: str):
     assert signal is None or cfg.lagrange.signal._target_.endswith(signal)
     assert (agent.projector is not None) == projector
     assert cfg.task.reward.get("risk_shaping", False) == shaping
+
+
+@pytest.mark.parametrize(
+    ("options", "limit"),
+    [
+        ((), 0.0874),
+        (("cost_limit=0.5",), 0.874),
+        (("gamma=1",), 0.05),
+        (("gamma=0",), 0.05 * 125),
+        (("task.duration=50", "task.policy_frequency=10"), 0.05 * 5 / (1 - 0.99**500)),
+        (("cost_limit=0.5", "lagrange.signal.cost_limit=0.2"), 0.2),
+    ],
+)
+def test_cost_limit_sets_the_episode_budget_of_sac_lag(options, limit: float):
+    """d = b (1 - g^T) / ((1 - g) T), unless the budget b itself is given."""
+    cfg = compose("algo=sac_lag", *options)
+    check_training(cfg)
+    signal = hydra.utils.instantiate(cfg.lagrange.signal)
+    assert signal.cost_limit == pytest.approx(limit, rel=1e-3)
 
 
 @pytest.mark.parametrize("option", [o for o in OPTIONS if o.startswith("experiment=")])

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
+import hydra
 import pytest
 import torch
-from small import EMPTY, SMALL
+from omegaconf import OmegaConf
+from small import EMPTY, SMALL, compose
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 
+from saferl.builders import build_trainer
+from saferl.checkpoint import CONFIG, export
+from saferl.commands import on_its_own_task, trained_policy
 from saferl.envs.intersection import (
     BatchedIntersection,
     HighwayIntersection,
@@ -19,8 +25,8 @@ from saferl.envs.intersection import (
     Reward,
     Scenario,
 )
-from saferl.envs.intersection.spawning import episode_seeds
 from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver
+from saferl.envs.intersection.spawning import episode_seeds
 from saferl.envs.transforms import SafetyProjector
 from saferl.evaluation import as_test, evaluate, write
 from saferl.metrics import FIGURES
@@ -147,22 +153,87 @@ def test_write(tmp_path: Path):
 
 
 def test_a_runs_closing_test_is_the_evaluation_of_its_checkpoint(tmp_path: Path, command):
-    """Training and testing agree (a peer's did not, PEERS 11): same policy, episodes and figures."""
-    arguments = (*EMPTY, "task=rt", "task.duration=2")
-    algo = ("algo=rsac", "projector.steps=5")
-    command("train", "config", *SMALL, *arguments, *algo, "evaluation.episodes=3", "out=run")
-    command("evaluate", "evaluate", *arguments, "checkpoint=run", "episodes=3", "out=test")
+    """Training and testing agree (a peer's did not, PEERS 11): same policy, episodes and figures,
+    on the run's own task, whose reward is not the default one here."""
+    task = (*EMPTY, "task=rt", "task.duration=2", "task.rows=4")
+    algo = ("algo=rsac", "projector.steps=5", "experiment=paper")
+    command("train", "config", *SMALL, *algo, *task, "evaluation.episodes=3", "out=run")
+    command("evaluate", "evaluate", "checkpoint=run", "episodes=3", "out=test")
     ours, theirs = (
         json.loads((tmp_path / name / "metrics.json").read_text())
         for name in ("run/evaluation", "test")
     )
     for name in FIGURES:
         assert ours[name] == pytest.approx(theirs[name], rel=1e-4), name
+    about = set(ours) - set(FIGURES) - {"policy"}
+    assert {key: ours[key] for key in about} == {key: theirs[key] for key in about}
+    assert ours["reading"] == "raw" and ours["rows"] == 4 and ours["scenario"] == "nominal"
+    assert ours["policy_frequency"] == 10 and ours["project"] is True and ours["vehicles"] == 0
 
     command("export", "export", "checkpoint=run", "out=policy")
-    command("evaluate", "evaluate", *arguments, "checkpoint=policy", "episodes=3", "out=again")
+    command("evaluate", "evaluate", "checkpoint=policy", "episodes=3", "out=again")
     again = json.loads((tmp_path / "again/metrics.json").read_text())
     assert all(again[name] == theirs[name] for name in FIGURES)
+
+
+def test_the_command_line_alone_changes_a_runs_own_task():
+    trained = compose("experiment=paper", "algo=sac_rs", *EMPTY, "task.rows=4", "task=gs")
+    own = Scenario(
+        task="gs", vehicles=0, rows=4, policy_frequency=10,
+        reward=Reward(reading="raw", destination_scale=100.0),
+    )  # fmt: skip
+    overrides: dict[tuple[str, ...], dict] = {
+        (): {},
+        ("task=lt",): {"task": "lt"},
+        ("task.vehicles=7", "episodes=3"): {"vehicles": 7},
+        ("task.policy_frequency=5", "task.route_starts=0.5"): {
+            "policy_frequency": 5,
+            "route_starts": 0.5,
+        },
+        ("task.reward.reading=normalised",): {"reward": Reward(destination_scale=100.0)},
+        ("+task.scenario=dense", "task.vehicles=null"): {"scenario": "dense", "traffic": {}},
+        ("+task.reward.risk_shaping=true",): {
+            "reward": dataclasses.replace(own.reward, risk_shaping=True)
+        },
+    }
+    for given, changes in overrides.items():
+        cfg = on_its_own_task(compose(*given, config="evaluate"), trained, given)
+        if "scenario" in changes:
+            changes = {**changes, "vehicles": None}
+        assert hydra.utils.instantiate(cfg.task) == dataclasses.replace(own, **changes), given
+        assert cfg.env._target_.endswith("BatchedIntersection") and cfg.env.num_envs == 100
+    given = ("env=highway", "env.num_envs=3")
+    cfg = on_its_own_task(compose(*given, config="evaluate"), trained, given)
+    assert cfg.env._target_.endswith("HighwayIntersection") and cfg.env.num_envs == 3
+
+
+def test_a_checkpoints_projector_acts_as_it_did_in_training(tmp_path: Path):
+    """Not at all before its start, in an exported policy as in the run."""
+    cfg = compose(*SMALL, *EMPTY, "algo=rsac", "projector.start=0.5")
+    trainer = build_trainer(cfg, tmp_path / "run")
+    trainer.save()
+    OmegaConf.save(cfg, tmp_path / "run" / CONFIG, resolve=True)
+    early = export(tmp_path / "run", tmp_path / "early")
+    assert [bool(t.enabled) for t in trained_policy(cfg, early)[1]] == [False]
+    assert [bool(t.enabled) for t in trained_policy(cfg, tmp_path / "run")[1]] == [False]
+    trainer.train()
+    late = export(tmp_path / "run", tmp_path / "late")
+    assert [bool(t.enabled) for t in trained_policy(cfg, late)[1]] == [True]
+    assert [bool(t.enabled) for t in trained_policy(cfg, tmp_path / "run")[1]] == [True]
+
+
+def test_tests_do_not_mix(tmp_path: Path, command, refusal):
+    """A folder of its own by default; a given one that holds a test is refused."""
+    arguments = ("evaluate", "evaluate", "policy=blind", *EMPTY, "task=rt", "episodes=1")
+    for _ in range(2):
+        command(*arguments)
+    first, second = (tmp_path / "evaluation/blind-rt-seed0").iterdir()
+    assert {path.name for path in first.iterdir()} == {"metrics.json", "episodes.csv"}
+    before = (second / "metrics.json").read_bytes()
+    line = refusal(*arguments, "seed=3", f"out={second}")
+    assert f"out: {second} holds a test already; take another folder." in line
+    assert (second / "metrics.json").read_bytes() == before
+    assert {path.name for path in tmp_path.iterdir()} == {"evaluation"}
 
 
 def test_seeds_do_not_repeat():

@@ -17,7 +17,7 @@ from torchrl.envs import RewardSum, TransformedEnv
 from saferl.builders import STORED, build_trainer
 from saferl.envs.intersection import BatchedIntersection, Scenario
 from saferl.envs.intersection.drivers import Driver
-from saferl.hooks import CriticSignal, EpisodeSignal
+from saferl.hooks import CriticSignal, EpisodeSignal, episode_budget
 from saferl.metrics import EpisodeWindow
 from saferl.trainer import Budget, Trainer
 
@@ -184,7 +184,7 @@ def test_episode_signal_uses_each_fresh_episode_once(tmp_path: Path):
     update = lagrange.update
     lagrange.update = lambda violation: (seen.append(violation.tolist()), update(violation))
     data = collect(trainer, 12)
-    limit = compose("algo=sac_lag").lagrange.signal.cost_limit
+    limit = episode_budget(0.05, 0.99, duration=1, policy_frequency=5)
     ended = [each["next", "episode_cost"][each["next", "done"]] for each in data]
     expected = [(costs - limit).tolist() for costs in ended if len(costs)]
     assert seen == [pytest.approx(costs) for costs in expected] and len(seen) == 2
