@@ -253,6 +253,7 @@ class BatchedIntersection(IntersectionBase):
                 "Compiling the simulation at its first step: about a minute, a few seconds the next time."
             )
         self._advance = _compiled(advance) if compile_physics else advance
+        self._restart = _compiled(restart) if compile_physics else restart
         # So many environments are reset at a time that a step in which a few episodes end is not
         # charged for all of them.
         self._chunk = max(min(num_envs, 32), num_envs // 8)
@@ -269,7 +270,7 @@ class BatchedIntersection(IntersectionBase):
             self._state = scenes_last(begin(self.scenario, seeds))
         order = reset.to(torch.int8).argsort(descending=True, stable=True)
         for rows in order.split(self._chunk)[: -(-int(reset.sum()) // self._chunk)]:
-            self._state = restart(self.scenario, self._state, seeds, reset, rows)
+            self._state = self._restart(self.scenario, self._state, seeds, reset, rows)
         no = torch.zeros_like(reset)
         return self._output(self._observation() | dict.fromkeys(OUTCOMES, no))
 

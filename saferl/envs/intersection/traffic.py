@@ -109,30 +109,37 @@ def road_rules(
     mine, their = (slice(0, count), None), (None,)  # i and j of pairs [N, T, ...]
     farther = all_s[their] > all_s[mine]
     tie = farther | ((all_s[their] == all_s[mine]) & (number[their] < number[mine]))
-    above = (rank[their] > rank[mine]) | ((rank[their] == rank[mine]) & tie)
+    above = _number((rank[their] > rank[mine]) | ((rank[their] == rank[mine]) & tie))
 
     approach = _and(lane.approach, own.approach)
     same = approach[their] == approach[mine]
     waiting = present & ~inside
-    first = waiting[:count] & ~(same & waiting[their] & farther).any(1)
+    first = waiting[:count] & (_number(same & waiting[their] & farther).amax(1) == 0)
 
     pace = speed.clamp_min(GO_SPEED)
-    meet = _meet(lane, s, pace, own, ego_s, ego_pace, ego) & ~same & there[their]
+    gap = _gap(lane, s, pace, own, ego_s, ego_pace, ego)
+    meet = _number((gap <= 0) & ~same & there[their])
     clash = _clash(vehicles, pace, zone[0][:, :count], zone[1][:, :count])
 
-    blocked = (clash & inside[None, :count]).any(1)
-    gives_way = torch.cat([meet[:, :count] | clash, meet[:, count:]], 1) & above
+    entrants = _number(inside)
+    blocked = (clash * entrants[None, :count]).amax(1)
+    gives_way = torch.cat([torch.maximum(meet[:, :count], clash), meet[:, count:]], 1) * above
     held = _held(first, vehicles.heedless, blocked, gives_way, present[count:])
 
     # Two that have entered and are bound for the same zone: the later one brakes before it.
     begin = zone[0]
-    within = s[:, None] >= begin
-    wait = clash & (within[:, :count].transpose(0, 1) | above[:, :count])
-    wait = torch.cat([wait, (meet & above)[:, count:]], 1)
-    wait = wait & ~within & inside[mine] & inside[their]
+    within = _number(s[:, None] >= begin)
+    wait = clash * torch.maximum(within[:, :count].transpose(0, 1), above[:, :count])
+    wait = torch.cat([wait, (meet * above)[:, count:]], 1)
+    wait = wait * (1 - within) * entrants[mine] * entrants[their]
     room = torch.cat([begin[:, :count], begin[:, count:] - EGO_ROOM], 1)
-    stop = torch.where(wait, room - 0.5, torch.inf).amin(1)
+    stop = torch.where(wait > 0, room - 0.5, torch.inf).amin(1)
     return vehicles._replace(entered=entered, held=held, stop=torch.where(held, STOP, stop))
+
+
+def _number(truth: Tensor) -> Tensor:
+    """1.0 and 0.0 for true and false: among many pairs, vector units are quicker with numbers."""
+    return torch.where(truth, 1.0, 0.0)
 
 
 def _held(
@@ -140,33 +147,35 @@ def _held(
 ) -> Tensor:
     """Who waits: a vehicle yields to those above it that do not wait themselves, bool [N, ...].
 
-    ``gives_way`` [N, T, ...] follows a total order, so as many rounds as there are approach lanes
+    ``gives_way`` [N, T, ...] (1.0 or 0.0, as ``blocked`` [N, ...]) follows a total order, so as many rounds as there are approach lanes
     settle it, from any start.
     """
     yields = first & ~heedless
-    blocked = blocked | (gives_way[:, -1:] & ego_free).any(1)
-    gives_way, yes = (
-        gives_way[:, :-1].float(),
-        first.float(),
-    )  # numbers are quicker than truth values
-    held = yields & blocked
+    blocked = torch.maximum(blocked, (gives_way[:, -1:] * _number(ego_free)).amax(1))
+    gives_way, yes = gives_way[:, :-1], _number(first)
+    held = yields & (blocked > 0)
     for _ in range(_LANES):
         free = torch.where(held, 0.0, yes)
-        held = yields & (blocked | ((gives_way * free[None]).amax(1) > 0))
+        held = yields & (torch.maximum(blocked, (gives_way * free[None]).amax(1)) > 0)
     return held
 
 
-def _meet(
+def _gap(
     lane: Lanes, s: Tensor, pace: Tensor, own: Lanes, ego_s: Tensor, ego_pace: Tensor, ego: Tensor
 ) -> Tensor:
-    """[N, T, ...]: do the rectangles of i and j meet within 2 s, both along their routes at constant
-    speed? The ego keeps its distance and angle to its route."""
+    """[N, T, ...]: the smallest separation of i and j within 2 s, m, both along their routes at constant
+    speed; the ego keeps its distance and angle to its route."""
     times = torch.tensor(TIMES, dtype=s.dtype, device=s.device).reshape(-1, *[1] * s.ndim)
     path, _ = lane_frames(lane, s + pace * times)  # [times, N, ...]
     size = (STRETCH * LENGTH, WIDTH)
-    gap = separation(
-        path.at((slice(None), slice(None), None)), path.at((slice(None), None)), size, size
-    )
+    # Every pair once, then its number at both of its places; no vehicle meets itself.
+    count = len(s)
+    i, j = torch.triu_indices(count, count, 1, device=s.device)
+    gap = separation(path.at((slice(None), i)), path.at((slice(None), j)), size, size).amin(0)
+    number = torch.arange(count, device=s.device)
+    low, high = torch.minimum(number[:, None], number), torch.maximum(number[:, None], number)
+    place = torch.where(low == high, len(i), low * (2 * count - low - 1) // 2 + high - low - 1)
+    gap = torch.cat([gap, torch.full_like(s[:1], torch.inf)])[place]
 
     here, heading = lane_frames(own, ego_s)
     lateral = (ego[..., 1] - here.y) * here.cos - (ego[..., 0] - here.x) * here.sin
@@ -175,17 +184,17 @@ def _meet(
     x, y, cos, sin = lane_frames(own, ego_s + ego_pace * times[:, 0])[0]
     beside = Frame(x - lateral * sin, y + lateral * cos, cos * c - sin * sn, sin * c + cos * sn)
     ego_gap = separation(path, beside.at((slice(None), None)), size, size)
-    return torch.cat([gap.amin(0), ego_gap.amin(0)[:, None]], 1) <= 0
+    return torch.cat([gap, ego_gap.amin(0)[:, None]], 1)
 
 
 def _clash(vehicles: Vehicles, pace: Tensor, begin: Tensor, end: Tensor) -> Tensor:
-    """[N, N, ...]: would vehicle i, at ``pace`` [N, ...] m/s, meet j in the zone of their routes, which
+    """[N, N, ...], 1.0 or 0.0: would vehicle i, at ``pace`` [N, ...] m/s, meet j in the zone of their routes, which
     lies at arc lengths ``begin`` to ``end`` [N, N, ...] of i's route?"""
     s, their_s = vehicles.s[:, None], vehicles.s[None]
     pace, slow = pace[:, None], vehicles.speed.clamp_min(0.5)[None]
     margin = TIME_MARGIN * vehicles.headway[:, None]
     their_begin, their_end = begin.transpose(0, 1), end.transpose(0, 1)
-    return (
+    return _number(
         torch.isfinite(begin)
         & (s < end)
         & (their_s < their_end)
