@@ -32,15 +32,9 @@ def train(cfg: DictConfig) -> None:
     """Train, or continue a run, then test the result."""
     if cfg.resume is None:
         run = Path(HydraConfig.get().runtime.output_dir)
-        if (run / "metrics.csv").exists() or (run / checkpoint.FOLDER).exists():
-            raise ValueError(
-                f"out: {run} holds a run already; continue it with resume={run}, or take another "
-                "folder."
-            )
         OmegaConf.resolve(cfg)
         trainer = build_trainer(cfg, run)
-        run.mkdir(parents=True, exist_ok=True)
-        OmegaConf.save(cfg, run / CONFIG)
+        claim(run, cfg)
     else:
         others = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]
         if others:
@@ -66,6 +60,24 @@ def train(cfg: DictConfig) -> None:
         seed=cfg.seed,
         policy_name=cfg.algo_name,
     )
+
+
+def claim(run: Path, cfg: DictConfig) -> None:
+    """Make a folder this run's own; of two runs that want it at once, one gets it.
+
+    Raises:
+        ValueError: it holds a run already.
+    """
+    run.mkdir(parents=True, exist_ok=True)
+    try:
+        if (run / checkpoint.FOLDER).exists():
+            raise FileExistsError
+        with (run / CONFIG).open("x") as file:
+            OmegaConf.save(cfg, file)
+    except FileExistsError:
+        raise ValueError(
+            f"out: {run} holds a run already; continue it with resume={run}, or take another folder."
+        ) from None
 
 
 def evaluate(cfg: DictConfig) -> None:
