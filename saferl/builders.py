@@ -243,6 +243,7 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         warmup_frames=cfg.warmup_frames,
         record_every=cfg.record_every,
         save_every=cfg.save_every,
+        save_minutes=cfg.get("save_minutes"),  # a run from before this setting has none
     )
     if cfg.lagrange.signal is not None:
         hydra.utils.instantiate(cfg.lagrange.signal).register(trainer)

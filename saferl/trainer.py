@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import signal
 import threading
 import time
@@ -138,6 +139,7 @@ class Trainer:
         warmup_frames: collected before the first update.
         record_every: frames between two rows of ``metrics.csv``.
         save_every: frames between two checkpoints.
+        save_minutes: of wall-clock, after which a checkpoint is due all the same; None: never.
         after_collect: called with each batch's finished episodes (a TensorDict of per-episode
             ``return``, ``cost_return`` and outcomes, [n]) and the fraction of the budget spent.
         loggers: TorchRL loggers that receive the scalars of each row.
@@ -154,6 +156,7 @@ class Trainer:
     warmup_frames: int = 1000
     record_every: int = 2000
     save_every: int = 50_000
+    save_minutes: float | None = 5.0
     window: EpisodeWindow = field(default_factory=EpisodeWindow)
     after_collect: list[Callable[[TensorDictBase, float], None]] = field(default_factory=list)
     loggers: list = field(default_factory=list)
@@ -167,11 +170,14 @@ class Trainer:
         ):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be >= {least}, got {getattr(self, name)}.")
+        if self.save_minutes is not None and not self.save_minutes > 0:
+            raise ValueError(f"save_minutes must be null or > 0, got {self.save_minutes}.")
         self.progress, self.clock = Progress(), Clock()
         self.metrics = CsvLog(self.run / "metrics.csv")
         self.timing = CsvLog(self.run / "timing.csv")
         self._sums: dict[str, Tensor] = {}
         self._count = 0
+        self._saved_at = time.monotonic()
         self.checkpoint = RunCheckpoint(
             self.run,
             loss=Fitting(self.learner.loss),
@@ -236,7 +242,7 @@ class Trainer:
                 bar.update((progress.episodes if by_episode else progress.frames) - bar.n)
                 if progress.frames - progress.last_record >= self.record_every:
                     self._record()
-                if progress.frames - progress.last_save >= self.save_every and self.spent < 1.0:
+                if self._save_is_due() and self.spent < 1.0:
                     self.save()
             if interrupted:
                 self.save()
@@ -259,11 +265,17 @@ class Trainer:
                 if end is not None:
                     end()
 
+    def _save_is_due(self) -> bool:
+        minutes = (time.monotonic() - self._saved_at) / 60
+        frames = self.progress.frames - self.progress.last_save
+        return frames >= self.save_every or minutes >= (self.save_minutes or math.inf)
+
     def save(self) -> None:
         """Write a checkpoint of everything, unless the newest one is of this very frame."""
         if self.progress.last_save < self.progress.frames:
             self.progress.last_save = self.progress.frames
             self.checkpoint.save(self.progress.frames, {"episodes": self.progress.episodes})
+        self._saved_at = time.monotonic()
 
     def _take(self, data: TensorDictBase) -> TensorDict:
         """Store a batch and make the updates it entitles to; returns its finished episodes [n]."""

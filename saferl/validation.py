@@ -36,6 +36,7 @@ TRAINING = {
     "alpha_init": (float, 0, math.inf),
     "record_every": (int, 1, math.inf),
     "save_every": (int, 1, math.inf),
+    "save_minutes": (float | None, 0, math.inf),
     "evaluation.episodes": (int, 1, math.inf),
     "evaluation.num_envs": (int, 1, math.inf),
     "evaluation.policy_frequency": (int, 1, math.inf),
@@ -45,7 +46,7 @@ TRAINING = {
     "cost_critic.members": (int, 0, math.inf),
     "init": (str | None, 0, 0),
 }
-POSITIVE = ("reward_scale", "tau", "alpha_init")
+POSITIVE = ("reward_scale", "tau", "alpha_init", "save_minutes")
 TESTING = {
     "episodes": (int, 1, math.inf),
     "seed": (int, 0, 2**31 - 1),

@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 from small import EMPTY, SMALL, compose
 from tensordict import TensorDict
 
@@ -149,3 +150,24 @@ def test_a_run_killed_before_its_first_episode_can_be_resumed(tmp_path: Path):
     assert copy.progress.frames == 0 and len(copy.buffer) == 0
     copy.train()
     assert copy.progress.frames == 24 and isinstance(copy.buffer[:], TensorDict)
+
+
+def test_a_checkpoint_by_the_clock_changes_nothing(tmp_path: Path):
+    """Due long before ``save_every`` frames; the run is the one that was never saved on the way."""
+    runs, saved = {}, {}
+    for minutes in ("1e-9", "null"):
+        cfg = compose(*SMALL, *EMPTY, "algo=rsac", "task.duration=1", f"save_minutes={minutes}")
+        trainer = runs[minutes] = build_trainer(cfg, tmp_path / minutes)
+        frames = saved[minutes] = []
+        save = trainer.checkpoint.save
+        trainer.checkpoint.save = lambda at, about, f=frames, s=save: (f.append(at), s(at, about))
+        trainer.train()
+    assert saved == {"1e-9": list(range(0, 25, 2)), "null": [0, 24]}
+    assert_same(everything(runs["1e-9"]), everything(runs["null"]))
+
+
+def test_a_run_from_before_a_setting_can_be_resumed(tmp_path: Path):
+    cfg = compose(*SMALL, *EMPTY, "algo=sac")
+    OmegaConf.set_struct(cfg, False)
+    del cfg["save_minutes"]
+    assert build_trainer(cfg, tmp_path).save_minutes is None

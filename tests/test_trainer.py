@@ -267,6 +267,8 @@ def test_trainer_refuses(name: str, value: int, tmp_path: Path):
     parts = {key: getattr(ours, key) for key in ("run", "collector", "buffer", "learner", "budget")}
     with pytest.raises(ValueError, match=f"{name} must be >= "):
         Trainer(**parts, stored=STORED, **{name: value})
+    with pytest.raises(ValueError, match="save_minutes must be null or > 0, got 0"):
+        Trainer(**parts, stored=STORED, save_minutes=0)
 
 
 def test_two_runs_that_start_at_once_do_not_share_a_folder(refusal, monkeypatch, tmp_path: Path):
