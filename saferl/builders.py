@@ -249,5 +249,5 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         hydra.utils.instantiate(cfg.lagrange.signal).register(trainer)
     if agent.projector is not None:
         ProjectorProgress(agent.projector).register(trainer)
-    trainer.loggers = build_loggers(cfg, run)
+    trainer.open_loggers = lambda: build_loggers(cfg, run)
     return trainer

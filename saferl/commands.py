@@ -47,7 +47,11 @@ def train(cfg: DictConfig) -> None:
         trainer = build_trainer(cfg, run)
         trainer.resume()
     log.info("%s on %s, seed %d. Files: %s", cfg.algo_name, cfg.task.task, cfg.seed, run)
-    trainer.train()
+    try:
+        trainer.train()
+    finally:
+        if not (run / checkpoint.FOLDER).exists():  # it never began
+            (run / CONFIG).unlink(missing_ok=True)
 
     settings = cfg.evaluation
     measure(

@@ -17,6 +17,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.data import ReplayBuffer
+from torchrl.record.loggers import Logger
 from tqdm import tqdm
 
 from saferl.checkpoint import BufferState, CollectorState, Fitting, GrowingFiles, RunCheckpoint
@@ -142,7 +143,8 @@ class Trainer:
         save_minutes: of wall-clock, after which a checkpoint is due all the same; None: never.
         after_collect: called with each batch's finished episodes (a TensorDict of per-episode
             ``return``, ``cost_return`` and outcomes, [n]) and the fraction of the budget spent.
-        loggers: TorchRL loggers that receive the scalars of each row.
+        open_loggers: makes the TorchRL loggers that receive the scalars of each row; called when
+            training starts.
         window: means over the last episodes.
     """
 
@@ -159,7 +161,7 @@ class Trainer:
     save_minutes: float | None = 5.0
     window: EpisodeWindow = field(default_factory=EpisodeWindow)
     after_collect: list[Callable[[TensorDictBase, float], None]] = field(default_factory=list)
-    loggers: list = field(default_factory=list)
+    open_loggers: Callable[[], Sequence[Logger]] = list
 
     def __post_init__(self):
         for name, least in (
@@ -177,6 +179,7 @@ class Trainer:
         self.timing = CsvLog(self.run / "timing.csv")
         self._sums: dict[str, Tensor] = {}
         self._count = 0
+        self._loggers: Sequence[Logger] = ()
         self._saved_at = time.monotonic()
         self.checkpoint = RunCheckpoint(
             self.run,
@@ -221,8 +224,6 @@ class Trainer:
         """
         progress = self.progress
         by_episode = self.budget.episodes is not None
-        if progress.last_save < 0:
-            self.save()
         bar = tqdm(
             total=self.budget.whole,
             initial=progress.episodes if by_episode else progress.frames,
@@ -233,7 +234,9 @@ class Trainer:
             postfix=self.window.short(),
         )
         batches = iter(self.collector)
-        with self._open_loggers(), _interrupts() as interrupted, bar:
+        with self._logging(), _interrupts() as interrupted, bar:
+            if progress.last_save < 0:
+                self.save()
             while self.spent < 1.0 and not interrupted:
                 with self.clock.phase("collect"):
                     data = next(batches)
@@ -254,16 +257,31 @@ class Trainer:
         self.save()
 
     @contextmanager
-    def _open_loggers(self) -> Iterator[None]:
-        """TorchRL's loggers have no end of their own; what they write to does."""
+    def _logging(self) -> Iterator[None]:
+        """Opens the loggers and tells them the rows of ``metrics.csv``, which a resume has cut off at
+        its checkpoint, in place of what an earlier session told them."""
+        self._loggers = self.open_loggers()
         try:
+            for sink in [logger.experiment for logger in self._loggers]:
+                # TensorBoard keeps every event; a new file can hide those of the files before it.
+                if self.progress.last_save >= 0 and hasattr(sink, "purge_step"):
+                    sink.close()
+                    sink.purge_step = 0
+            for row in self.metrics.read():
+                self._log(row)
             yield
         finally:
-            for logger in self.loggers:
+            # TorchRL's loggers have no end of their own; what they write to does.
+            for logger in self._loggers:
                 sink = logger.experiment
                 end = getattr(sink, "close", None) or getattr(sink, "finish", None)
                 if end is not None:
                     end()
+
+    def _log(self, row: dict[str, float]) -> None:
+        for logger in self._loggers:
+            for key, value in row.items():
+                logger.log_scalar(key, value, step=int(row["frames"]))
 
     def _save_is_due(self) -> bool:
         minutes = (time.monotonic() - self._saved_at) / 60
@@ -322,6 +340,4 @@ class Trainer:
         self.metrics.write(row)
         seconds = self.clock.seconds
         self.timing.write({"frames": progress.frames, "updates": progress.updates, **seconds})
-        for logger in self.loggers:
-            for key, value in row.items():
-                logger.log_scalar(key, value, step=progress.frames)
+        self._log(row)
