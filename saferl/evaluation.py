@@ -18,8 +18,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from saferl.envs.intersection import Scenario
-from saferl.envs.intersection.spawning import episode_seeds
 from saferl.envs.intersection.geometry import ROUTES
+from saferl.envs.intersection.spawning import episode_seeds
 from saferl.metrics import summarise
 
 
@@ -189,5 +189,7 @@ def write(rows: list[dict], out: Path, **about: str | int | float) -> dict:
         writer.writeheader()
         writer.writerows(rows)
     figures = summarise(rows)
-    (out / "metrics.json").write_text(json.dumps({**figures, **about}, indent=2) + "\n")
+    (out / "metrics.json").write_text(
+        json.dumps({**figures, **about}, indent=2, allow_nan=False) + "\n"
+    )
     return figures
