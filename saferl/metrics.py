@@ -55,6 +55,9 @@ def finished_episodes(data: TensorDictBase) -> TensorDict:
 class EpisodeWindow:
     """Means over the last episodes.
 
+    ``return`` holds r_safe where ``shaping=risk`` adds it, and is then not to be compared with other
+    algorithms'; the return of a test never does.
+
     Args:
         length: how many episodes.
 
