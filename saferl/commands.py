@@ -18,7 +18,7 @@ from saferl.builders import build_env, build_trainer, load_agent
 from saferl.checkpoint import CONFIG, run_folder
 from saferl.envs.intersection import Scenario
 from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver
-from saferl.evaluation import as_test, write
+from saferl.evaluation import as_test, envs_at_once, write
 from saferl.evaluation import evaluate as play_episodes
 from saferl.metrics import table
 from saferl.paths import pretrained_run
@@ -192,7 +192,7 @@ def measure(
     policy_name: str,
 ) -> list[dict]:
     """Play, write ``metrics.json`` and ``episodes.csv``, report the table; returns the rows."""
-    env = build_env(cfg, scenario, min(num_envs, episodes), seed, *transforms)
+    env = build_env(cfg, scenario, envs_at_once(episodes, num_envs), seed, *transforms)
     rows = play_episodes(policy, env, episodes, seed)
     for transform in transforms:  # free for another environment
         transform.reset_parent()

@@ -10,6 +10,7 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 from small import EMPTY, SMALL, compose
 
+from saferl.builders import build_env
 from saferl.envs.intersection import CollisionCost, Reward, Scenario
 from saferl.evaluation import write
 from saferl.metrics import FIGURES
@@ -101,3 +102,17 @@ def test_metrics_are_json_that_everything_reads(tmp_path: Path):
     assert json.loads((tmp_path / "metrics.json").read_text())["return"]["mean"] == 0.0
     with pytest.raises(ValueError, match="not JSON compliant"):
         write([{**row, "return": math.nan}], tmp_path)
+
+
+def test_a_test_plays_hardly_more_episodes_than_it_needs(command, tmp_path: Path, monkeypatch):
+    made = []
+
+    def build(cfg, scenario, num_envs, *others):
+        made.append(num_envs)
+        return build_env(cfg, scenario, num_envs, *others)
+
+    monkeypatch.setattr("saferl.commands.build_env", build)
+    options = ("env=batched", "task.vehicles=0", "task.duration=1")
+    command("evaluate", "evaluate", "policy=blind", *options, "episodes=7", "env.num_envs=6")
+    assert made == [4]  # two rounds, as of 6
+    assert (tmp_path / "evaluation/episodes.csv").read_text().count("\n") == 8
