@@ -102,7 +102,9 @@ def main() -> None:
     medians = {name: statistics.median(values) for name, values in rates.items()}
 
     print(f"load {os.getloadavg()[0]:.1f}, {options.clock} clock, {options.rounds} rounds")
-    print(f"{'':16s}{'decisions/s':>12s}{'ratio':>8s}{'us each':>9s}{'first step':>12s}{'state':>9s}")
+    print(
+        f"{'':16s}{'decisions/s':>12s}{'ratio':>8s}{'us each':>9s}{'first step':>12s}{'state':>9s}"
+    )
     print(f"{'stock':16s}{medians['stock']:12.1f}{1.0:8.1f}{1e6 / medians['stock']:9.1f}")
     result = {"stock": medians["stock"], "clock": options.clock, "rounds": rates}
     for one in ours:
@@ -119,7 +121,9 @@ def main() -> None:
             "state_MB": one.megabytes,
         }
     if options.device == "cuda":
-        print(f"{torch.cuda.get_device_name()}: peak {torch.cuda.max_memory_allocated() / 2**20:.0f} MB")
+        print(
+            f"{torch.cuda.get_device_name()}: peak {torch.cuda.max_memory_allocated() / 2**20:.0f} MB"
+        )
     if options.json:
         options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(json.dumps(result, indent=2) + "\n")

@@ -275,10 +275,11 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         warmup_frames=cfg.warmup_frames,
         record_every=cfg.record_every,
         save_every=cfg.save_every,
+        save_minutes=cfg.get("save_minutes"),  # a run from before this setting has none
     )
     if cfg.lagrange.signal is not None:
         hydra.utils.instantiate(cfg.lagrange.signal).register(trainer)
     if agent.projector is not None:
         ProjectorProgress(agent.projector).register(trainer)
-    trainer.loggers = build_loggers(cfg, run)
+    trainer.open_loggers = lambda: build_loggers(cfg, run)
     return trainer

@@ -19,7 +19,7 @@ from saferl.builders import build_env, build_trainer, load_agent
 from saferl.checkpoint import CONFIG, run_config, run_folder
 from saferl.envs.intersection import Scenario
 from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver
-from saferl.evaluation import TEST, as_test, write
+from saferl.evaluation import TEST, as_test, envs_at_once, write
 from saferl.evaluation import evaluate as play_episodes
 from saferl.metrics import table
 from saferl.paths import pretrained_run
@@ -34,15 +34,9 @@ def train(cfg: DictConfig) -> None:
     """Train, or continue a run, then test the result."""
     if cfg.resume is None:
         run = Path(HydraConfig.get().runtime.output_dir)
-        if (run / "metrics.csv").exists() or (run / checkpoint.FOLDER).exists():
-            raise ValueError(
-                f"out: {run} holds a run already; continue it with resume={run}, or take another "
-                "folder."
-            )
         OmegaConf.resolve(cfg)
         trainer = build_trainer(cfg, run)
-        run.mkdir(parents=True, exist_ok=True)
-        OmegaConf.save(cfg, run / CONFIG)
+        claim(run, cfg)
     else:
         others = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]
         if others:
@@ -55,7 +49,11 @@ def train(cfg: DictConfig) -> None:
         trainer = build_trainer(cfg, run)
         trainer.resume()
     log.info("%s on %s, seed %d. Files: %s", cfg.algo_name, cfg.task.task, cfg.seed, run)
-    trainer.train()
+    try:
+        trainer.train()
+    finally:
+        if not (run / checkpoint.FOLDER).exists():  # it never began
+            (run / CONFIG).unlink(missing_ok=True)
 
     settings = cfg.evaluation
     try:
@@ -72,6 +70,24 @@ def train(cfg: DictConfig) -> None:
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"Interrupted in the closing test. Repeat it with resume={run}"
+        ) from None
+
+
+def claim(run: Path, cfg: DictConfig) -> None:
+    """Make a folder this run's own; of two runs that want it at once, one gets it.
+
+    Raises:
+        ValueError: it holds a run already.
+    """
+    run.mkdir(parents=True, exist_ok=True)
+    try:
+        if (run / checkpoint.FOLDER).exists():
+            raise FileExistsError
+        with (run / CONFIG).open("x") as file:
+            OmegaConf.save(cfg, file)
+    except FileExistsError:
+        raise ValueError(
+            f"out: {run} holds a run already; continue it with resume={run}, or take another folder."
         ) from None
 
 
@@ -205,7 +221,7 @@ def measure(
     policy_name: str,
 ) -> list[dict]:
     """Play, write ``metrics.json`` and ``episodes.csv``, report the table; returns the rows."""
-    env = build_env(cfg, scenario, min(num_envs, episodes), seed, *transforms)
+    env = build_env(cfg, scenario, envs_at_once(episodes, num_envs), seed, *transforms)
     rows = play_episodes(policy, env, episodes, seed)
     for transform in transforms:  # free for another environment
         transform.reset_parent()

@@ -152,6 +152,16 @@ def episode_rows(steps: list[TensorDictBase], seeds: Tensor) -> list[dict]:
     return rows
 
 
+def envs_at_once(episodes: int, most: int) -> int:
+    """The fewest environments that play so many episodes in no more rounds than ``most`` would.
+
+    >>> envs_at_once(101, most=100), envs_at_once(500, most=100), envs_at_once(3, most=100)
+    (51, 100, 3)
+    """
+    rounds = math.ceil(episodes / most)
+    return math.ceil(episodes / rounds)
+
+
 def evaluate(
     policy: TensorDictModuleBase, env: EnvBase, episodes: int, seed: int, progress: bool = True
 ) -> list[dict]:
@@ -193,5 +203,7 @@ def write(rows: list[dict], out: Path, /, **about: str | int | float | None) -> 
         writer.writeheader()
         writer.writerows(rows)
     figures = summarise(rows)
-    (out / "metrics.json").write_text(json.dumps({**figures, **about}, indent=2) + "\n")
+    (out / "metrics.json").write_text(
+        json.dumps({**figures, **about}, indent=2, allow_nan=False) + "\n"
+    )
     return figures

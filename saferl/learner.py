@@ -35,12 +35,19 @@ class Learner:
     ):
         self.loss, self.optimizer, self.target_updater = loss, optimizer, target_updater
         self.after_update = after_update or []
-        self._forward = torch.compile(loss) if compile else loss
+        self._forward = loss
         if compile:
             log.info("Compiling the loss at its first update: this takes about a minute.")
+            self._compiled = torch.compile(loss)
+            self._forward = self._forward_quietly
+
+    def _forward_quietly(self, batch: TensorDictBase) -> TensorDictBase:
+        """Without warnings about how TensorDict compiles, at the first update or a later one."""
+        with warnings.catch_warnings():
             warnings.filterwarnings(
                 "ignore", category=UserWarning, module="tensordict|torch._dynamo"
             )
+            return self._compiled(batch)
 
     def schedule(self, spent: float) -> None:
         """Set the learning rates for a fraction of the budget."""

@@ -55,6 +55,9 @@ def finished_episodes(data: TensorDictBase) -> TensorDict:
 class EpisodeWindow:
     """Means over the last episodes.
 
+    ``return`` holds r_safe where ``shaping=risk`` adds it, and is then not to be compared with other
+    algorithms'; the return of a test never does.
+
     Args:
         length: how many episodes.
 
@@ -105,6 +108,13 @@ class CsvLog:
 
     def __init__(self, path: Path):
         self.path = path
+
+    def read(self) -> list[dict[str, float]]:
+        """The rows so far, without what a row leaves empty."""
+        if not self.path.exists():
+            return []
+        with self.path.open(newline="") as file:
+            return [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file)]
 
     def write(self, row: dict[str, float]) -> None:
         """Append a row (keys are column names)."""

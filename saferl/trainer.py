@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import signal
 import threading
 import time
@@ -16,6 +17,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.data import ReplayBuffer
+from torchrl.record.loggers import Logger
 from tqdm import tqdm
 
 from saferl.checkpoint import BufferState, CollectorState, Fitting, GrowingFiles, RunCheckpoint
@@ -138,9 +140,11 @@ class Trainer:
         warmup_frames: collected before the first update.
         record_every: frames between two rows of ``metrics.csv``.
         save_every: frames between two checkpoints.
+        save_minutes: of wall-clock, after which a checkpoint is due all the same; None: never.
         after_collect: called with each batch's finished episodes (a TensorDict of per-episode
             ``return``, ``cost_return`` and outcomes, [n]) and the fraction of the budget spent.
-        loggers: TorchRL loggers that receive the scalars of each row.
+        open_loggers: makes the TorchRL loggers that receive the scalars of each row; called when
+            training starts.
         window: means over the last episodes.
     """
 
@@ -154,9 +158,10 @@ class Trainer:
     warmup_frames: int = 1000
     record_every: int = 2000
     save_every: int = 50_000
+    save_minutes: float | None = 5.0
     window: EpisodeWindow = field(default_factory=EpisodeWindow)
     after_collect: list[Callable[[TensorDictBase, float], None]] = field(default_factory=list)
-    loggers: list = field(default_factory=list)
+    open_loggers: Callable[[], Sequence[Logger]] = list
 
     def __post_init__(self):
         for name, least in (
@@ -167,11 +172,15 @@ class Trainer:
         ):
             if getattr(self, name) < least:
                 raise ValueError(f"{name} must be >= {least}, got {getattr(self, name)}.")
+        if self.save_minutes is not None and not self.save_minutes > 0:
+            raise ValueError(f"save_minutes must be null or > 0, got {self.save_minutes}.")
         self.progress, self.clock = Progress(), Clock()
         self.metrics = CsvLog(self.run / "metrics.csv")
         self.timing = CsvLog(self.run / "timing.csv")
         self._sums: dict[str, Tensor] = {}
         self._count = 0
+        self._loggers: Sequence[Logger] = ()
+        self._saved_at = time.monotonic()
         self.checkpoint = RunCheckpoint(
             self.run,
             loss=Fitting(self.learner.loss),
@@ -215,8 +224,6 @@ class Trainer:
         """
         progress = self.progress
         by_episode = self.budget.episodes is not None
-        if progress.last_save < 0:
-            self.save()
         bar = tqdm(
             total=self.budget.whole,
             initial=progress.episodes if by_episode else progress.frames,
@@ -227,7 +234,9 @@ class Trainer:
             postfix=self.window.short(),
         )
         batches = iter(self.collector)
-        with self._open_loggers(), _interrupts() as interrupted, bar:
+        with self._logging(), _interrupts() as interrupted, bar:
+            if progress.last_save < 0:
+                self.save()
             while self.spent < 1.0 and not interrupted:
                 with self.clock.phase("collect"):
                     data = next(batches)
@@ -236,7 +245,7 @@ class Trainer:
                 bar.update((progress.episodes if by_episode else progress.frames) - bar.n)
                 if progress.frames - progress.last_record >= self.record_every:
                     self._record()
-                if progress.frames - progress.last_save >= self.save_every and self.spent < 1.0:
+                if self._save_is_due() and self.spent < 1.0:
                     self.save()
             if interrupted:
                 self.save()
@@ -248,22 +257,43 @@ class Trainer:
         self.save()
 
     @contextmanager
-    def _open_loggers(self) -> Iterator[None]:
-        """TorchRL's loggers have no end of their own; what they write to does."""
+    def _logging(self) -> Iterator[None]:
+        """Opens the loggers and tells them the rows of ``metrics.csv``, which a resume has cut off at
+        its checkpoint, in place of what an earlier session told them."""
+        self._loggers = self.open_loggers()
         try:
+            for sink in [logger.experiment for logger in self._loggers]:
+                # TensorBoard keeps every event; a new file can hide those of the files before it.
+                if self.progress.last_save >= 0 and hasattr(sink, "purge_step"):
+                    sink.close()
+                    sink.purge_step = 0
+            for row in self.metrics.read():
+                self._log(row)
             yield
         finally:
-            for logger in self.loggers:
+            # TorchRL's loggers have no end of their own; what they write to does.
+            for logger in self._loggers:
                 sink = logger.experiment
                 end = getattr(sink, "close", None) or getattr(sink, "finish", None)
                 if end is not None:
                     end()
+
+    def _log(self, row: dict[str, float]) -> None:
+        for logger in self._loggers:
+            for key, value in row.items():
+                logger.log_scalar(key, value, step=int(row["frames"]))
+
+    def _save_is_due(self) -> bool:
+        minutes = (time.monotonic() - self._saved_at) / 60
+        frames = self.progress.frames - self.progress.last_save
+        return frames >= self.save_every or minutes >= (self.save_minutes or math.inf)
 
     def save(self) -> None:
         """Write a checkpoint of everything, unless the newest one is of this very frame."""
         if self.progress.last_save < self.progress.frames:
             self.progress.last_save = self.progress.frames
             self.checkpoint.save(self.progress.frames, {"episodes": self.progress.episodes})
+        self._saved_at = time.monotonic()
 
     def _take(self, data: TensorDictBase) -> TensorDict:
         """Store a batch and make the updates it entitles to; returns its finished episodes [n]."""
@@ -310,6 +340,4 @@ class Trainer:
         self.metrics.write(row)
         seconds = self.clock.seconds
         self.timing.write({"frames": progress.frames, "updates": progress.updates, **seconds})
-        for logger in self.loggers:
-            for key, value in row.items():
-                logger.log_scalar(key, value, step=progress.frames)
+        self._log(row)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Sequence
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin
@@ -36,6 +37,7 @@ TRAINING = {
     "alpha_init": (float, 0, math.inf),
     "record_every": (int, 1, math.inf),
     "save_every": (int, 1, math.inf),
+    "save_minutes": (float | None, 0, math.inf),
     "evaluation.episodes": (int, 1, math.inf),
     "evaluation.num_envs": (int, 1, math.inf),
     "evaluation.policy_frequency": (int, 1, math.inf),
@@ -44,8 +46,9 @@ TRAINING = {
     "critic.members": (int, 1, math.inf),
     "cost_critic.members": (int, 0, math.inf),
     "init": (str | None, 0, 0),
+    "algo_name": (str, 0, 0),
 }
-POSITIVE = ("reward_scale", "tau", "alpha_init")
+POSITIVE = ("reward_scale", "tau", "alpha_init", "save_minutes")
 TESTING = {
     "episodes": (int, 1, math.inf),
     "seed": (int, 0, 2**31 - 1),
@@ -67,6 +70,8 @@ def check_training(cfg: DictConfig) -> None:
     """
     check_keys(cfg)
     check_numbers(cfg, TRAINING)
+    if {"/", "\\"} & set(cfg.algo_name):
+        raise ValueError(f"algo_name must be without / and \\, got {cfg.algo_name!r}.")
     for name, rates in cfg.lr.items():
         pair = isinstance(rates, ListConfig) and len(rates) == 2
         if not pair or not all(fits(rate, float) and 0 <= rate < math.inf for rate in rates):
@@ -119,29 +124,39 @@ def check_keys(cfg: DictConfig) -> None:
     assert isinstance(primary, DictConfig)
     groups = {folder.name for folder in root.iterdir() if folder.is_dir()} - {"hydra"}
     known = (set(primary) | groups | {"algo_name"}) - {"defaults", "hydra", "algo", "experiment"}
-    _refuse_unknown(cfg, known, "")
+    _check_like(cfg, [primary], "", known)
     for name in ("lr", "evaluation"):
-        _refuse_unknown(cfg[name], set(primary[name]), f"{name}.")
+        _check_like(cfg[name], [primary[name]], f"{name}.")
     for group in groups & set(cfg):
         if isinstance(cfg[group], DictConfig) and "_target_" not in cfg[group]:
             files = [OmegaConf.load(path) for path in (root / group).glob("*.yaml")]
-            _refuse_unknown(cfg[group], {key for file in files for key in file}, f"{group}.")
+            _check_like(cfg[group], files, f"{group}.")
 
 
-def _refuse_unknown(node: DictConfig, known: set, prefix: str) -> None:
-    for key in node:
+def _check_like(node: DictConfig, files: list, prefix: str, known: set | None = None) -> None:
+    """Refuse keys that none of the files has, and plain values where they have mappings."""
+    known = known or {key for file in files for key in file}
+    for key, value in node.items():
         if key not in known:
             raise ValueError(
                 f"unknown key {prefix}{key!s}; choose from {', '.join(sorted(map(str, known)))}."
             )
+        like = {type(file[key]): file[key] for file in files if key in file}
+        if DictConfig in like and type(value) not in like:
+            raise ValueError(
+                f"{prefix}{key!s} must be a mapping of {', '.join(like[DictConfig])}, got {value!r}."
+            )
 
 
 def check_targets(node: Any, path: str = "") -> None:
-    """Check each ``_target_`` below a node against its signature: names and kinds of arguments.
+    """Check each ``_target_`` below a node against its signature (names and kinds of arguments), and
+    that every number is finite.
 
     Raises:
         ValueError: names the key and what is allowed.
     """
+    if isinstance(node, float) and not math.isfinite(node):
+        raise ValueError(f"{path} must be finite, got {node}.")
     if isinstance(node, ListConfig):
         for index, item in enumerate(node):
             check_targets(item, f"{path}[{index}]")
@@ -202,7 +217,7 @@ def fits(value: Any, kind: Any) -> bool:
     if origin in (tuple, list, Sequence) and inner[0] in _KINDS:
         listed = isinstance(value, (list, tuple, ListConfig))
         return listed and all(fits(item, inner[0]) for item in value)
-    return True
+    return not is_dataclass(kind)
 
 
 def describe(kind: Any) -> str:
@@ -217,4 +232,6 @@ def describe(kind: Any) -> str:
         return " or ".join(map(str, get_args(kind)))
     if get_origin(kind) in (tuple, list, Sequence):
         return f"a list, each {describe(get_args(kind)[0])}"
+    if is_dataclass(kind):
+        return f"a mapping of {', '.join(field.name for field in fields(kind))}"
     return _KINDS.get(kind, str(kind))

@@ -110,3 +110,5 @@ def test_csv_takes_late_columns(tmp_path: Path):
     with log.path.open() as file:
         rows = list(csv.DictReader(file))
     assert rows == [{"a": "1", "b": ""}, {"a": "2", "b": "3"}, {"a": "", "b": "4"}]
+    assert log.read() == [{"a": 1.0}, {"a": 2.0, "b": 3.0}, {"b": 4.0}]
+    assert CsvLog(tmp_path / "none.csv").read() == []

@@ -7,7 +7,9 @@ import time
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 from small import EMPTY, SMALL, compose
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensordict import TensorDict
 
 from saferl.builders import build_trainer
@@ -149,3 +151,92 @@ def test_a_run_killed_before_its_first_episode_can_be_resumed(tmp_path: Path):
     assert copy.progress.frames == 0 and len(copy.buffer) == 0
     copy.train()
     assert copy.progress.frames == 24 and isinstance(copy.buffer[:], TensorDict)
+
+
+def test_a_checkpoint_by_the_clock_changes_nothing(tmp_path: Path):
+    """Due long before ``save_every`` frames; the run is the one that was never saved on the way."""
+    runs, saved = {}, {}
+    for minutes in ("1e-9", "null"):
+        cfg = compose(*SMALL, *EMPTY, "algo=rsac", "task.duration=1", f"save_minutes={minutes}")
+        trainer = runs[minutes] = build_trainer(cfg, tmp_path / minutes)
+        frames = saved[minutes] = []
+        save = trainer.checkpoint.save
+        trainer.checkpoint.save = lambda at, about, f=frames, s=save: (f.append(at), s(at, about))
+        trainer.train()
+    assert saved == {"1e-9": list(range(0, 25, 2)), "null": [0, 24]}
+    assert_same(everything(runs["1e-9"]), everything(runs["null"]))
+
+
+def test_a_run_from_before_a_setting_can_be_resumed(tmp_path: Path):
+    cfg = compose(*SMALL, *EMPTY, "algo=sac")
+    OmegaConf.set_struct(cfg, False)
+    del cfg["save_minutes"]
+    assert build_trainer(cfg, tmp_path).save_minutes is None
+
+
+def events(run: Path, key: str) -> list[tuple[int, float]]:
+    """Steps and values that TensorBoard shows."""
+    shown = EventAccumulator(str(run / "tensorboard")).Reload()
+    return [(event.step, event.value) for event in shown.Scalars(key)]
+
+
+@pytest.mark.parametrize("save_every", [12, 1000])
+def test_tensorboard_shows_a_resumed_run_once(save_every: int, tmp_path: Path):
+    """What came after the checkpoint is hidden, even where that was before the first row."""
+    options = [*SMALL, *EMPTY, "algo=sac", "logger=tensorboard", f"save_every={save_every}"]
+    killed = build_trainer(compose(*options), tmp_path / "killed")
+    record = killed._record
+
+    def die():
+        record()
+        if killed.progress.frames >= 16:
+            raise InterruptedError
+
+    killed._record = die
+    with pytest.raises(InterruptedError):
+        killed.train()
+    assert [step for step, _ in events(tmp_path / "killed", "updates")] == [8, 16]
+    restored(tmp_path / "killed", *options).train()
+    build_trainer(compose(*options), tmp_path / "whole").train()
+    for key in ("updates", "loss_actor"):
+        shown = events(tmp_path / "killed", key)
+        assert [step for step, _ in shown] == [8, 16, 24]
+        assert shown == events(tmp_path / "whole", key)
+
+
+def test_a_logger_that_opens_is_told_every_row(tmp_path: Path):
+    """Even those that a kill kept from its files, or, as W&B does, when it begins a new run."""
+    told: list[tuple[str, int]] = []
+
+    class Sink:
+        experiment = None
+
+        def log_scalar(self, key: str, value: float, step: int) -> None:
+            told.append((key, step))
+
+    options = [*SMALL, *EMPTY, "algo=sac"]
+    build_trainer(compose(*options), tmp_path).train()
+    copy = restored(tmp_path, *options)
+    copy.open_loggers = lambda: [Sink()]
+    copy.train()
+    assert [step for key, step in told if key == "updates"] == [8, 16, 24]
+
+
+def test_loggers_open_when_training_starts(tmp_path: Path, refusal, monkeypatch):
+    """A refused resume leaves no logger's folder, and a logger that cannot open leaves no run."""
+    options = (*SMALL, *EMPTY, "algo=sac", "logger=tensorboard")
+    run = tmp_path / "run"
+    build_trainer(compose(*options), run)
+    assert not run.exists()
+    run.mkdir()
+    OmegaConf.save(compose(*options), run / "config.yaml", resolve=True)
+    assert "holds no checkpoint" in refusal("train", "config", "resume=run")
+    assert [path.name for path in run.iterdir()] == ["config.yaml"]
+
+    def missing(*args, **kwargs):
+        raise ImportError("no tensorboard")
+
+    monkeypatch.setattr("torchrl.record.loggers.TensorboardLogger", missing)
+    line = refusal("train", "config", *options, "out=new")
+    assert "TensorboardLogger needs a package that is not installed (no tensorboard)" in line
+    assert not (tmp_path / "new").exists()

@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import csv
 import math
+import re
+import warnings
 from pathlib import Path
+from warnings import catch_warnings, simplefilter, warn_explicit
 
+import hydra
 import pytest
 import torch
+from omegaconf import OmegaConf
 from small import EMPTY, SMALL, compose
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.envs import RewardSum, TransformedEnv
 
+from saferl import commands
 from saferl.builders import STORED, build_trainer
+from saferl.checkpoint import CONFIG
 from saferl.envs.intersection import BatchedIntersection, Scenario
 from saferl.envs.intersection.drivers import Driver
 from saferl.hooks import CriticSignal, EpisodeSignal, episode_budget
 from saferl.metrics import EpisodeWindow
+from saferl.paths import config_dir
 from saferl.trainer import Budget, Trainer
 
 
@@ -252,6 +260,24 @@ def test_no_episode_need_end(tmp_path: Path):
     assert row["episodes"] == "0" and math.isnan(float(row["return"]))
 
 
+def test_compiling_leaves_everyones_warnings_alone(tmp_path: Path, monkeypatch):
+    def compile(loss):
+        def compiled(batch):
+            warn_explicit("of how it compiles", UserWarning, "utils.py", 1, "tensordict.utils")
+            return loss(batch)
+
+        return compiled
+
+    monkeypatch.setattr(torch, "compile", compile)
+    with catch_warnings(record=True) as heard:
+        simplefilter("always")
+        before = list(warnings.filters)
+        trainer = trainer_of(tmp_path, "algo=sac", "compile=true")
+        collect(trainer, 5)
+        assert trainer.progress.updates and warnings.filters == before
+    assert not any("of how it compiles" in str(each.message) for each in heard)
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [("updates_per_frame", -1), ("warmup_frames", 0), ("record_every", 0), ("save_every", 0)],
@@ -261,3 +287,25 @@ def test_trainer_refuses(name: str, value: int, tmp_path: Path):
     parts = {key: getattr(ours, key) for key in ("run", "collector", "buffer", "learner", "budget")}
     with pytest.raises(ValueError, match=f"{name} must be >= "):
         Trainer(**parts, stored=STORED, **{name: value})
+    with pytest.raises(ValueError, match="save_minutes must be null or > 0, got 0"):
+        Trainer(**parts, stored=STORED, save_minutes=0)
+
+
+def test_two_runs_that_start_at_once_do_not_share_a_folder(refusal, monkeypatch, tmp_path: Path):
+    def build(cfg, run):
+        trainer = build_trainer(cfg, run)
+        commands.claim(run, OmegaConf.create({"seed": 7}))  # the other run, faster by a moment
+        return trainer
+
+    monkeypatch.setattr(commands, "build_trainer", build)
+    line = refusal("train", "config", *SMALL, *EMPTY, "algo=sac", "out=run")
+    assert "run holds a run already; continue it with resume=" in line
+    assert [path.name for path in (tmp_path / "run").iterdir()] == [CONFIG]
+    assert "seed: 7\n" in (tmp_path / "run" / CONFIG).read_text()
+
+
+def test_default_folders_tell_microseconds():
+    with hydra.initialize_config_dir(config_dir(), version_base="1.3"):
+        made = hydra.compose("config", return_hydra_config=True).hydra
+    for folder in (made.run.dir, made.sweep.dir):
+        assert re.search(r"/\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d-\d{6}$", folder), folder

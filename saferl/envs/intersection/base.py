@@ -97,8 +97,11 @@ class Scenario:
             raise ValueError(f"rows must be >= 1, got {self.rows}.")
         if self.policy_frequency <= 0:
             raise ValueError(f"policy_frequency must be > 0, got {self.policy_frequency}.")
-        if self.duration <= 0:
-            raise ValueError(f"duration must be > 0 seconds, got {self.duration}.")
+        if not 0 < self.duration < float("inf") or self.horizon < 1:
+            raise ValueError(
+                f"duration must be at least a decision, {1 / self.policy_frequency} seconds, "
+                f"got {self.duration}."
+            )
         if not 0.0 <= self.route_starts <= 1.0:
             raise ValueError(f"route_starts must be in [0, 1], got {self.route_starts}.")
 
@@ -109,6 +112,10 @@ class Scenario:
         traffic = build("traffic", SCENARIOS[self.scenario], self.traffic)
         if self.vehicles is not None:
             traffic = dataclasses.replace(traffic, vehicles=(self.vehicles, self.vehicles))
+        if self.rows < 2 and traffic.vehicles[1] > 0:
+            raise ValueError(
+                f"rows must be >= 2 with traffic, got {self.rows}: one row is always padding."
+            )
         object.__setattr__(self, "traffic", traffic)
         if self.standstill is not None and self.standstill <= 0:
             raise ValueError(f"standstill must be null or > 0 seconds, got {self.standstill}.")

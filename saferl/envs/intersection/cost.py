@@ -51,6 +51,10 @@ class CollisionCost:
                 raise ValueError(f"cost.{name} must be > 0, got {getattr(self, name)}.")
         if self.initial < 0:
             raise ValueError(f"cost.initial must be >= 0, got {self.initial}.")
+        if len(self.growth) != 2 or not 0 < self.growth[0] <= self.growth[1]:
+            raise ValueError(
+                f"cost.growth must be 2 numbers with 0 < first <= last, got {self.growth}."
+            )
 
     def __call__(self, ego: Tensor, control: Tensor, vehicles: Tensor, observed: Tensor) -> Tensor:
         """Cost [...] of a state and action.

@@ -52,6 +52,15 @@ class Reward:
             )
         if not self.destination_scale > 0:
             raise ValueError(f"reward.destination_scale must be > 0, got {self.destination_scale}.")
+        if not self.collision <= 0:
+            raise ValueError(f"reward.collision must be <= 0, got {self.collision}.")
+        if not self.arrival >= 0:
+            raise ValueError(f"reward.arrival must be >= 0, got {self.arrival}.")
+        for name, count in (("weights", 6), ("energy", 2), ("smoothness", 2)):
+            if len(getattr(self, name)) != count:
+                raise ValueError(
+                    f"reward.{name} must be {count} numbers, got {getattr(self, name)}."
+                )
 
     def reference(self, ego: Tensor, route: Tensor) -> Tensor:
         """r_ref [...] of the state ``ego`` [..., 6] on ``route`` [...]."""
