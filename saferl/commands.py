@@ -221,6 +221,7 @@ def measure(
     policy_name: str,
 ) -> list[dict]:
     """Play, write ``metrics.json`` and ``episodes.csv``, report the table; returns the rows."""
+    most = scenario.traffic.vehicles[1]
     env = build_env(cfg, scenario, envs_at_once(episodes, num_envs), seed, *transforms)
     rows = play_episodes(policy, env, episodes, seed)
     for transform in transforms:  # free for another environment
@@ -232,7 +233,7 @@ def measure(
         policy=policy_name,
         task=scenario.task,
         env=backend,
-        vehicles=scenario.vehicles,
+        vehicles=most,
         rows=scenario.rows,
         scenario=scenario.scenario,
         reading=scenario.reward.reading,
@@ -241,6 +242,6 @@ def measure(
         episodes=episodes,
         seed=seed,
     )
-    title = f"{policy_name}: {episodes} episodes of {scenario.task}, {scenario.vehicles} vehicles"
+    title = f"{policy_name}: {episodes} episodes of {scenario.task}, {most} vehicles"
     log.info("\n%s\nFiles: %s", table(figures, title), out)
     return rows

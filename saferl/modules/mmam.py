@@ -288,7 +288,7 @@ class MMAMValue(nn.Module):
             pooled = (pairs * share).sum(-2)
             y_mlp = joint_scene + _linear(token, joint_on_action) + _linear(pooled, joint_on_pairs)
             for weight, bias in layers:
-                y_mlp = _linear(F.gelu(y_mlp), weight, bias)
+                y_mlp = _linear(F.gelu(y_mlp), weight, bias)  # pyright: ignore[reportArgumentType]
             return y_attn.unsqueeze(-1) + _linear(F.gelu(y_mlp), w_mlp)
 
         return value

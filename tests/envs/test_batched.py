@@ -423,4 +423,4 @@ def test_snapshot_is_the_state_of_one_environment():
     ego, others = env.snapshot(1)
     assert ego.shape == (6,) and others.shape == (0, 6)
     assert torch.allclose(torch.tensor(ego).float(), view["ego"][1, 1:7])
-    assert env.render(0) is None
+    assert env.render(0).shape == (600, 600, 3)

@@ -163,7 +163,7 @@ def test_leaving_the_road_ends_the_episode():
 
 
 def test_a_collision_ends_the_episode_and_was_priced_before():
-    env = IntersectionEnv(task="gs")
+    env = IntersectionEnv(task="gs", vehicles=1)
     for seed in range(20):
         env.reset(seed=seed)
         if len(env.road.s):

@@ -60,7 +60,7 @@ class Scenario:
         vehicles: surrounding vehicles drawn at reset; None: as many as the scenario says.
         rows: M, rows of the ``vehicles`` observation; one is always padding.
         scenario: the traffic: a name in :data:`SCENARIOS`.
-        traffic: settings of :class:`Traffic` that differ from the scenario's.
+        traffic: a :class:`Traffic`, or a mapping of what differs from the scenario's.
         policy_frequency: decisions per second; each is integrated in 3 substeps.
         duration: seconds until ``truncated``.
         route_starts: fraction of the starts drawn uniformly along the route instead of 40 m before
@@ -79,7 +79,7 @@ class Scenario:
     task: str = "mixed"
     vehicles: int | None = None
     scenario: str = "nominal"
-    traffic: Traffic | Mapping[str, Any] = field(default_factory=dict)
+    traffic: Traffic = field(default_factory=dict)  # pyright: ignore  (a mapping becomes a Traffic)
     rows: int = ROWS
     policy_frequency: int = 5
     duration: float = 25.0

@@ -79,8 +79,9 @@ class IntersectionEnv(gymnasium.Env):
         cost: CollisionCost | Mapping[str, Any] | None = None,
         render_mode: str | None = None,
     ):
+        settings: Any = traffic or {}
         self.scenario = Scenario(
-            task=task, vehicles=vehicles, scenario=scenario, traffic=traffic or {}, rows=rows,
+            task=task, vehicles=vehicles, scenario=scenario, traffic=settings, rows=rows,
             policy_frequency=policy_frequency, duration=duration, route_starts=route_starts,
             standstill=standstill, reward=build("reward", Reward(), reward or {}),
             cost=build("cost", CollisionCost(), cost or {}),

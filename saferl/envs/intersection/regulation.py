@@ -74,6 +74,17 @@ class IntersectionRoad(RegulatedRoad):
         held: [N] bool, waits at the entry line; stop: [N] arc length where it must stop, or inf.
     """
 
+    slot: np.ndarray
+    route: np.ndarray
+    s: np.ndarray
+    speed: np.ndarray
+    desired: np.ndarray
+    headway: np.ndarray
+    heedless: np.ndarray
+    acceleration: np.ndarray
+    held: np.ndarray
+    stop: np.ndarray
+
     def __init__(self, network: RoadNetwork | None = None):
         super().__init__(network or build_network(), [], [])
         self.table = routes()
