@@ -191,7 +191,7 @@ def test_the_command_line_alone_changes_a_runs_own_task():
             "route_starts": 0.5,
         },
         ("task.reward.reading=normalised",): {"reward": Reward(destination_scale=100.0)},
-        ("+task.scenario=dense", "task.vehicles=null"): {"scenario": "dense", "traffic": {}},
+        ("task.scenario=dense", "task.vehicles=null"): {"scenario": "dense", "traffic": {}},
         ("+task.reward.risk_shaping=true",): {
             "reward": dataclasses.replace(own.reward, risk_shaping=True)
         },

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from saferl.builders import build_trainer
 from saferl.trainer import Trainer
 
-TRAFFIC = ("task.vehicles=3", "task=gs")
+TRAFFIC = ("env=highway", "task.vehicles=3", "task=gs")
 
 
 def everything(trainer: Trainer) -> dict:
@@ -82,13 +82,16 @@ def test_killed_and_resumed_equals_uninterrupted(algo: str, tmp_path: Path, spaw
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "killed" / name).read_bytes()
 
 
-@pytest.mark.parametrize("algo", ["sac_lag", "rsac"])
-def test_every_later_step_is_the_same(algo: str, tmp_path: Path):
+@pytest.mark.parametrize(
+    ("algo", "vehicles", "scenario"), [("sac_lag", 0, "nominal"), ("rsac", 5, "dense")]
+)
+def test_every_later_step_is_the_same(algo: str, vehicles: int, scenario: str, tmp_path: Path):
     """In one process: the state after a resume equals the state that was saved, and so does each
     update, action and environment step from there, with a multiplier, a late projector, a PID's
     memory, a buffer that has wrapped round, and loss sums of half a row."""
     options = [*SMALL, *EMPTY, f"algo={algo}", "frames=120", "record_every=31", "save_every=1000"]
     options += ["buffer_size=40", "task.duration=3"]
+    options += [f"task.vehicles={vehicles}", f"task.scenario={scenario}"]
     options += ["projector.start=0.4", "lagrange=pid"] if algo == "rsac" else []
     trainer = build_trainer(compose(*options), tmp_path / "a")
     trainer.save()

@@ -113,6 +113,8 @@ def test_a_test_plays_hardly_more_episodes_than_it_needs(command, tmp_path: Path
 
     monkeypatch.setattr("saferl.commands.build_env", build)
     options = ("env=batched", "task.vehicles=0", "task.duration=1")
-    command("evaluate", "evaluate", "policy=blind", *options, "episodes=7", "env.num_envs=6")
+    command(
+        "evaluate", "evaluate", "policy=blind", *options, "episodes=7", "env.num_envs=6", "out=test"
+    )
     assert made == [4]  # two rounds, as of 6
-    assert (tmp_path / "evaluation/episodes.csv").read_text().count("\n") == 8
+    assert (tmp_path / "test/episodes.csv").read_text().count("\n") == 8

@@ -90,7 +90,7 @@ def test_rows_are_a_setting():
         ({"vehicles": -1}, "vehicles must be >= 0, got -1"),
         ({"rows": 0}, "rows must be >= 1, got 0"),
         ({"policy_frequency": 0}, "policy_frequency must be > 0, got 0"),
-        ({"duration": 0.0}, "duration must be > 0 seconds, got 0.0"),
+        ({"duration": 0.0}, r"duration must be at least a decision, 0.2 seconds, got 0.0"),
         ({"route_starts": 1.5}, r"route_starts must be in \[0, 1\], got 1.5"),
         ({"standstill": -2.0}, "standstill must be null or > 0 seconds, got -2.0"),
     ],

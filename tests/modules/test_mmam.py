@@ -59,7 +59,10 @@ def plain_policy(net, ego, vehicles, scale):
     z_1 = z_1 + multi_head(z_1, z_1, w_q, w_k, w_v, hop, scale)
     ego_hop = net.ego_attention
     weights = (m.weight for m in (ego_hop.query, ego_hop.key, ego_hop.value, ego_hop.merge))
-    return multi_head(z_1[:1], z_1, *weights, scale).squeeze(0)
+    row = (z_1[:1] + multi_head(z_1[:1], z_1, *weights, scale)).squeeze(0)
+    for layer in net.layers:
+        row = F.gelu(layer(row))
+    return row
 
 
 def plain_value(net, ego, vehicles, action, scale):
@@ -73,6 +76,8 @@ def plain_value(net, ego, vehicles, action, scale):
     for row in z_sv:
         pooled = pooled + F.gelu(net.pair(torch.cat([row, z_ego[0], z_action[0]]))) / len(z_sv)
     y_mlp = F.gelu(net.joint(torch.cat([z_ego, z_action, pooled], dim=-1)))
+    for layer in net.layers:
+        y_mlp = F.gelu(layer(y_mlp))
     return (y_attn @ net.w_attn.weight.T + y_mlp @ net.w_mlp.weight.T).squeeze(0)
 
 
