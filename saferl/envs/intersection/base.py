@@ -180,7 +180,7 @@ class IntersectionBase(EnvBase):
 
     def _set_seed(self, seed: int | None) -> None:
         index = torch.arange(self.batch_size[0], dtype=torch.int64, device=self.device)
-        self._stream = mix(index + int(seed or 0) * self.batch_size[0], 0)
+        self._stream = mix(mix(torch.full_like(index, int(seed or 0)), 0) + index, 0)
         self._episode = torch.zeros_like(self._stream)
 
     def _next_seeds(self, tensordict: TensorDictBase | None, reset: Tensor) -> Tensor:
@@ -207,7 +207,10 @@ class IntersectionBase(EnvBase):
         return TensorDict(out, batch_size=self.batch_size, device=self.device)
 
     def snapshot(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """States of the ego [6] and of the others [N, 6] of one environment, float64."""
+        """States of the ego [6] and of the others [N, 6] of one environment, float64.
+
+        Row k is vehicle k for the whole episode, and NaN while it is off the road.
+        """
         raise NotImplementedError
 
     def render(self, index: int) -> np.ndarray | None:
