@@ -22,8 +22,9 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from saferl.builders import load_agent
-from saferl.checkpoint import BufferState, latest
+from saferl.checkpoint import latest
 from saferl.commands import run_config
+from saferl.components import BufferState
 from saferl.envs.intersection import CollisionCost
 from saferl.envs.intersection.dynamics import step_ego, to_physical
 from saferl.envs.intersection.geometry import offroad

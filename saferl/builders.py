@@ -17,7 +17,8 @@ from torchrl.envs import EnvBase, RewardScaling, RewardSum, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 from torchrl.objectives import LossModule, SoftUpdate
 
-from saferl.checkpoint import Fitting, Networks, latest, load_component, run_config
+from saferl.checkpoint import latest, load_component, run_config
+from saferl.components import Fitting, Networks
 from saferl.envs.intersection import Scenario
 from saferl.envs.transforms import ExecutedAction, SafetyProjector
 from saferl.hooks import ProjectorProgress

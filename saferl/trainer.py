@@ -20,7 +20,8 @@ from torchrl.data import ReplayBuffer
 from torchrl.record.loggers import Logger
 from tqdm import tqdm
 
-from saferl.checkpoint import BufferState, CollectorState, Fitting, GrowingFiles, RunCheckpoint
+from saferl.checkpoint import RunCheckpoint
+from saferl.components import BufferState, CollectorState, Fitting, GrowingFiles
 from saferl.learner import Learner
 from saferl.metrics import CsvLog, EpisodeWindow
 

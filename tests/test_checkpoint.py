@@ -16,17 +16,8 @@ from torchrl.checkpoint import Checkpoint
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from saferl.builders import build_agent, build_trainer, load_agent
-from saferl.checkpoint import (
-    CONFIG,
-    EXPORTED,
-    BufferState,
-    Fitting,
-    GrowingFiles,
-    RunCheckpoint,
-    export,
-    latest,
-    run_folder,
-)
+from saferl.checkpoint import CONFIG, EXPORTED, RunCheckpoint, export, latest, run_folder
+from saferl.components import BufferState, Fitting, GrowingFiles
 from saferl.paths import pretrained_run
 
 

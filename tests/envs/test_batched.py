@@ -424,3 +424,28 @@ def test_snapshot_is_the_state_of_one_environment():
     assert ego.shape == (6,) and others.shape == (0, 6)
     assert torch.allclose(torch.tensor(ego).float(), view["ego"][1, 1:7])
     assert env.render(0).shape == (600, 600, 3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", ["nominal", "dense"])
+def test_compiled_is_eager(scenario):
+    """Steps and partial resets, with traffic; a compiler may order sums otherwise."""
+    envs = [
+        BatchedIntersection(Scenario(scenario=scenario), 4, seed=3, compile_physics=compiled)
+        for compiled in (False, True)
+    ]
+    views = [env.reset() for env in envs]
+    actions, resets = noise(40, 4), 0
+    for action in actions:
+        for view in views:
+            view["action"] = action
+        steps, views = zip(
+            *(env.step_and_maybe_reset(view) for env, view in zip(envs, views, strict=True)),
+            strict=True,
+        )
+        eager, compiled = (step["next"] for step in steps)
+        for key in ("ego", "vehicles", "reward", "cost"):
+            torch.testing.assert_close(compiled[key], eager[key], rtol=1e-4, atol=1e-3)
+        assert equal(compiled, eager, ("done", "route", *OUTCOMES))
+        resets += int(eager["done"].sum())
+    assert resets

@@ -82,7 +82,7 @@ class HighwayIntersection(IntersectionBase):
         return self._stack(("ego", "vehicles", "route", *OUTCOMES))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        for index, action in enumerate(tensordict["action"].cpu().numpy()):
+        for index, action in enumerate(tensordict.get("action").cpu().numpy()):
             self._step_one(index, action.copy())
         ends = ("reward", "cost", "terminated", "truncated", "done")
         return self._stack(("ego", "vehicles", "route", *OUTCOMES, *ends))
