@@ -217,7 +217,7 @@ def _compiled(function: Callable) -> Callable:
     compiled = torch.compile(function, fullgraph=True, dynamic=False)
 
     def run(*args):
-        with torch._dynamo.config.patch(specialize_float=True):
+        with torch._dynamo.config.patch(specialize_float=True, recompile_limit=64):
             return compiled(*args)
 
     return run
