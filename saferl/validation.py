@@ -27,6 +27,7 @@ TRAINING = {
     "frames": (int | None, 1, math.inf),
     "gamma": (float, 0, 1),
     "cost_limit": (float, 0, math.inf),
+    "cost_target": (Literal["max", "mean"], 0, 0),
     "batch_size": (int, 1, math.inf),
     "buffer_size": (int, 1, math.inf),
     "warmup_frames": (int, 1, math.inf),

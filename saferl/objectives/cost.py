@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from copy import deepcopy
 from typing import Any
 
@@ -15,6 +16,12 @@ from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import _cache_values, _vmap_func, distance_loss
 
 from saferl.modules import CriticEnsemble, LagrangeMultiplier
+
+#: What the cost critics' target makes of the values of its members, [n, *B, 1].
+COST_TARGETS: dict[str, Callable[[Tensor], Tensor]] = {
+    "max": lambda values: values.amax(0),
+    "mean": lambda values: values.mean(0),
+}
 
 
 class CostCriticLoss(LossModule):
@@ -29,7 +36,9 @@ class CostCriticLoss(LossModule):
         L_c = E\Big[\sum_i \tfrac12 \big(Q_{c,i}(s, a) - c
               - \gamma (1 - \tau) \max_j Q^-_{c,j}(s', \tilde a')\big)^2\Big] \quad (E13, paper)
 
-    where :math:`\tau` is ``terminated``. The subclass calls :meth:`_add_cost_critic`
+    where :math:`\tau` is ``terminated``, and the mean over :math:`j` may take the place of
+    the maximum (``cost_target="mean"``): the maximum of members that differ by chance is
+    too high, and each target passes that on to the next one. The subclass calls :meth:`_add_cost_critic`
     once its other networks are there, and defines :meth:`_sample_next`.
     """
 
@@ -40,6 +49,7 @@ class CostCriticLoss(LossModule):
     target_cost_critic_params: TensorDictParams
     lagrange: LagrangeMultiplier
     cost_limit: Tensor
+    cost_target: str
 
     # Of the loss beside this base, or made late.
     tensor_keys: Any
@@ -57,6 +67,7 @@ class CostCriticLoss(LossModule):
         *,
         lagrange: LagrangeMultiplier,
         cost_limit: float,
+        cost_target: str,
         create_target_params: bool,
         compare_against: list[nn.Parameter] | None,
     ) -> None:
@@ -64,7 +75,11 @@ class CostCriticLoss(LossModule):
             raise ValueError(f"cost_limit must be >= 0, got {cost_limit}.")
         if num_cost_critics < 1:
             raise ValueError(f"num_cost_critics must be >= 1, got {num_cost_critics}.")
-        self.num_cost_critics = num_cost_critics
+        if cost_target not in COST_TARGETS:
+            raise ValueError(
+                f"cost_target must be one of {', '.join(COST_TARGETS)}, got {cost_target!r}."
+            )
+        self.num_cost_critics, self.cost_target = num_cost_critics, cost_target
         self.convert_to_functional(
             cost_critic,  # pyright: ignore[reportArgumentType]
             "cost_critic",
@@ -172,7 +187,7 @@ class CostCriticLoss(LossModule):
         tensordict: TensorDictBase,
         next_sample: tuple[TensorDictBase, Tensor] | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """E13: cost critics against the largest target value, with no entropy.
+        """E13: cost critics against the target value, with no entropy.
 
         Args:
             tensordict (TensorDictBase): the batch.
@@ -190,7 +205,8 @@ class CostCriticLoss(LossModule):
             )
         next_state, _ = next_sample or self._sample_next(tensordict)
         with torch.no_grad():
-            next_value = self._cost_values(next_state, self.target_cost_critic_params).max(0)[0]
+            next_value = self._cost_values(next_state, self.target_cost_critic_params)
+            next_value = COST_TARGETS[self.cost_target](next_value)
             target = self._cost_value_estimator.value_estimate(
                 tensordict.copy(), next_value=next_value
             )

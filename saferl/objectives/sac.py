@@ -62,6 +62,8 @@ class SACLagLoss(CostCriticLoss, SACLoss):
         lagrange (LagrangeMultiplier): the multiplier, saved with the loss.
         cost_limit (float, optional): bound on the discounted cost value, in the
             unit of ``cost``. Defaults to ``0.05``.
+        cost_target ("max" or "mean", optional): what :math:`Q_c^-` is of the members of
+            the target. Defaults to ``"max"`` (paper), whose overestimate feeds itself.
         num_qvalue_nets (int, optional): reward critics. Defaults to ``2``.
         num_cost_critics (int, optional): cost critics. Defaults to ``2``.
         delay_qvalue (bool, optional): keep target copies of both kinds of
@@ -148,6 +150,7 @@ class SACLagLoss(CostCriticLoss, SACLoss):
         *,
         lagrange: LagrangeMultiplier,
         cost_limit: float = 0.05,
+        cost_target: Literal["max", "mean"] = "max",
         num_qvalue_nets: int = 2,
         num_cost_critics: int = 2,
         alpha_init: float = 1.0,
@@ -187,6 +190,7 @@ class SACLagLoss(CostCriticLoss, SACLoss):
             num_cost_critics,
             lagrange=lagrange,
             cost_limit=cost_limit,
+            cost_target=cost_target,
             create_target_params=delay_qvalue,
             compare_against=list(actor_network.parameters()) if separate_losses else None,
         )

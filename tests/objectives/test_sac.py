@@ -411,6 +411,11 @@ def test_to_double_after_use(make_loss, make_batch):
 # Errors
 
 
+def test_a_bad_cost_target_is_named(make_loss):
+    with pytest.raises(ValueError, match="cost_target must be one of max, mean, got 'min'"):
+        make_loss(cost_target="min")
+
+
 @pytest.mark.parametrize("limit", [-1.0, float("nan"), float("inf")])
 def test_a_bad_cost_limit_is_named(make_loss, limit):
     with pytest.raises(ValueError, match=rf"cost_limit must be >= 0, got {limit}\."):

@@ -194,6 +194,12 @@ def test_cost_target_takes_the_larger_value_and_no_entropy(constant_loss, ending
     torch.testing.assert_close(metadata["td_error"], torch.tensor([target - 0.1]))
 
 
+def test_cost_target_can_be_the_mean(constant_loss):
+    constant_loss.cost_target = "mean"
+    value, _ = constant_loss.cost_loss(transition())
+    torch.testing.assert_close(value, half_squares(0.5 + 0.8 * 2.5, 0.1, 0.4))
+
+
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_reward_target_takes_the_smaller_value_and_the_entropy(constant_loss, ending):
     terminated, truncated = ENDINGS[ending]
