@@ -10,6 +10,7 @@ from typing import Any
 import hydra
 import torch
 from omegaconf import DictConfig
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -20,6 +21,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 from saferl.checkpoint import latest, load_component, run_config
 from saferl.components import Fitting, Networks
 from saferl.envs.intersection import Scenario
+from saferl.envs.intersection.drivers import CautiousDriver, Driver, NoisyDriver
 from saferl.envs.transforms import ExecutedAction, SafetyProjector
 from saferl.hooks import ProjectorProgress
 from saferl.learner import Learner
@@ -64,6 +66,24 @@ def build_env(
     """The configured backend with a scenario; transforms from the inside outwards."""
     env = make(cfg.env, scenario=scenario, num_envs=num_envs, seed=seed, device=device_of(cfg))
     return TransformedEnv(env, Compose(*transforms)) if transforms else env  # pyright: ignore
+
+
+@torch.no_grad()
+def demonstrate(cfg: DictConfig, scenario: Scenario) -> TensorDict:
+    """Transitions [N] of scripted drivers for the replay buffer, N at least ``cfg.demonstrations``.
+
+    Half of them are a cautious driver's and half a blind one's, all with Gaussian noise of 0.2 on
+    the action, so that crashes and arrivals are both among them.
+    """
+    num_envs, parts = cfg.env.num_envs, []
+    steps = -(-cfg.demonstrations // (2 * num_envs))
+    for number, driver in enumerate((CautiousDriver(), Driver())):
+        env = build_env(cfg, scenario, num_envs, cfg.seed + 1 + number)
+        driver = NoisyDriver(driver, std=0.2, seed=cfg.seed)
+        data = env.rollout(steps, driver, break_when_any_done=False).reshape(-1)
+        parts.append(data.set(("next", "action_executed"), data["action"].clone()))
+        env.close()
+    return torch.cat(parts)  # pyright: ignore[reportCallIssue, reportArgumentType]
 
 
 @dataclass
@@ -282,5 +302,7 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         hydra.utils.instantiate(cfg.lagrange.signal).register(trainer)
     if agent.projector is not None:
         ProjectorProgress(agent.projector).register(trainer)
+    if cfg.get("demonstrations"):
+        trainer.demonstrate = lambda: demonstrate(cfg, scenario)
     trainer.open_loggers = lambda: build_loggers(cfg, run)
     return trainer

@@ -144,6 +144,8 @@ class Trainer:
         save_minutes: of wall-clock, after which a checkpoint is due all the same; None: never.
         after_collect: called with each batch's finished episodes (a TensorDict of per-episode
             ``return``, ``cost_return`` and outcomes, [n]) and the fraction of the budget spent.
+        demonstrate: gives transitions [N] that the buffer holds before the first frame, or None; they
+            count as no frames.
         open_loggers: makes the TorchRL loggers that receive the scalars of each row; called when
             training starts.
         window: means over the last episodes.
@@ -162,6 +164,7 @@ class Trainer:
     save_minutes: float | None = 5.0
     window: EpisodeWindow = field(default_factory=EpisodeWindow)
     after_collect: list[Callable[[TensorDictBase, float], None]] = field(default_factory=list)
+    demonstrate: Callable[[], TensorDictBase] | None = None
     open_loggers: Callable[[], Sequence[Logger]] = list
 
     def __post_init__(self):
@@ -237,6 +240,8 @@ class Trainer:
         batches = iter(self.collector)
         with self._logging(), _interrupts() as interrupted, bar:
             if progress.last_save < 0:
+                if self.demonstrate is not None:
+                    self._store(self.demonstrate())
                 self.save()
             while self.spent < 1.0 and not interrupted:
                 with self.clock.phase("collect"):
@@ -302,7 +307,7 @@ class Trainer:
         finished = self.window.extend(data)
         progress.frames += data.numel()
         progress.episodes += finished.shape[0]
-        self.buffer.extend(data.select(*self.stored, strict=False).contiguous().reshape(-1))
+        self._store(data)
         for hook in self.after_collect:
             hook(finished, self.spent)
         if progress.frames < self.warmup_frames:
@@ -315,6 +320,9 @@ class Trainer:
                 progress.updates += 1
                 self._add(self.learner.update(self.buffer.sample()))
         return finished
+
+    def _store(self, data: TensorDictBase) -> None:
+        self.buffer.extend(data.select(*self.stored, strict=False).contiguous().reshape(-1))
 
     def _add(self, losses: TensorDictBase) -> None:
         for key, value in losses.items():

@@ -31,6 +31,7 @@ TRAINING = {
     "batch_size": (int, 1, math.inf),
     "buffer_size": (int, 1, math.inf),
     "warmup_frames": (int, 1, math.inf),
+    "demonstrations": (int, 0, math.inf),
     "updates_per_frame": (float, 0, math.inf),
     "reward_scale": (float, 0, math.inf),
     "tau": (float, 0, 1),

@@ -110,8 +110,10 @@ def restart(scenario: Scenario, state: State, seed: Tensor, reset: Tensor, rows:
     mask = reset[rows]
 
     def merge(old: Tensor, new: Tensor) -> Tensor:
-        new = torch.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old[rows])
-        return old.index_copy(0, rows, new)
+        # Along the last dimension, or the copy would lay the scenes out one after the other.
+        old, new = old.movedim(0, -1), new.movedim(0, -1)
+        new = torch.where(mask, new, old[..., rows])
+        return old.index_copy(-1, rows, new).movedim(-1, 0)
 
     return {key: merge(old, fresh[key]) for key, old in state.items()}
 
