@@ -78,10 +78,11 @@ def check_training(cfg: DictConfig) -> None:
         pair = isinstance(rates, ListConfig) and len(rates) == 2
         if not pair or not all(fits(rate, float) and 0 <= rate < math.inf for rate in rates):
             raise ValueError(f"lr.{name} must be [first, last], both >= 0, got {rates!r}.")
-    if cfg.buffer_size < cfg.batch_size:
-        raise ValueError(
-            f"buffer_size must be >= batch_size, got {cfg.buffer_size} and {cfg.batch_size}."
-        )
+    for key in ("batch_size", "demonstrations"):
+        if cfg.buffer_size < cfg[key]:
+            raise ValueError(
+                f"buffer_size must be >= {key}, got {cfg.buffer_size} and {cfg[key]}."
+            )
     check_targets(cfg)
 
 

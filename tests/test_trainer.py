@@ -23,7 +23,7 @@ from saferl import commands
 from saferl.builders import STORED, build_trainer
 from saferl.checkpoint import CONFIG
 from saferl.envs.intersection import BatchedIntersection, Scenario
-from saferl.envs.intersection.drivers import Driver
+from saferl.envs.intersection.drivers import CautiousDriver, Driver
 from saferl.hooks import CriticSignal, EpisodeSignal, episode_budget
 from saferl.metrics import EpisodeWindow
 from saferl.paths import config_dir
@@ -59,6 +59,23 @@ def test_random_warm_up_differs_between_environments(tmp_path: Path):
     action = collect(trainer, 1)[0]["action"]
     assert len(action.reshape(-1, 2).unique(dim=0)) == 6
     assert action.abs().max() <= 1 and action.std() > 0.2
+
+
+def test_demonstrations_fill_the_buffer_before_the_first_frame(tmp_path: Path):
+    options = ("algo=arsac", "demonstrations=101", "buffer_size=200", "episodes=null", "frames=8")
+    trainer = build_trainer(compose(*SMALL, *options, "env.num_envs=2"), tmp_path)
+    trainer.demonstrate, shown = None, trainer.demonstrate()
+    assert 101 <= len(shown) < 101 + 2 * trainer.collector.env.batch_size[0]
+    # A mean error of 0.16 is that of the noise.
+    for half, driver in zip(shown.split(len(shown) // 2), (CautiousDriver(), Driver()), strict=True):
+        error = half["action"] - driver(half.clone())["action"]
+        assert error.abs().mean() < 0.17
+    trainer.demonstrate = lambda: shown
+    trainer.train()
+    stored = trainer.buffer[:]
+    assert len(stored) == len(shown) + 8 and trainer.progress.frames == 8
+    for key in ("action", ("next", "cost"), ("next", "ego")):
+        assert torch.equal(stored[key][: len(shown)], shown[key])
 
 
 def test_threads_are_one_unless_asked_for(tmp_path: Path):

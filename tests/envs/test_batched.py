@@ -426,6 +426,20 @@ def test_snapshot_is_the_state_of_one_environment():
     assert env.render(0).shape == (600, 600, 3)
 
 
+@pytest.mark.parametrize("num_envs", [1, 5])
+@pytest.mark.parametrize("scenario", ["nominal", "dense", "noisy"])
+def test_the_state_is_always_laid_out_alike(scenario, num_envs):
+    """Scenes side by side, after steps and resets: other strides would be compiled once more."""
+    env, strides = BatchedIntersection(Scenario(scenario=scenario), num_envs), set()
+    view, resets = env.reset(), 0
+    for action in noise(40, num_envs):
+        step, view = env.step_and_maybe_reset(view.set("action", action))
+        resets += int(step["next", "done"].sum())
+        strides.add(tuple((key, value.stride()) for key, value in env._state.items()))
+    assert resets and len(strides) == 1
+    assert all(value.movedim(0, -1).is_contiguous() for value in env._state.values())
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["nominal", "dense"])
 def test_compiled_is_eager(scenario):

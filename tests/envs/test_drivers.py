@@ -10,7 +10,7 @@ from tensordict import TensorDict
 
 from saferl import evaluation
 from saferl.envs.intersection import BatchedIntersection, Scenario
-from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver
+from saferl.envs.intersection.drivers import CautiousDriver, Driver, NoisyDriver, RandomDriver
 from saferl.envs.intersection.geometry import ROUTES
 
 NORTH = -math.pi / 2
@@ -152,3 +152,15 @@ def test_random_driver_is_uniform_on_the_box():
     assert (quantiles - expected).abs().max() < 0.06
     assert torch.corrcoef(action.T)[0, 1].abs() < 0.06
     assert torch.corrcoef(torch.stack([action[1:, 0], action[:-1, 0]]))[0, 1].abs() < 0.06
+
+
+def test_noise_lies_around_the_drivers_action_and_follows_its_seed():
+    view = BatchedIntersection(Scenario(task="gs", vehicles=0), num_envs=2000).reset()
+    plain = Driver()(view.clone())["action"]
+    first, again, other = (
+        NoisyDriver(Driver(), std=0.2, seed=seed)(view.clone())["action"] for seed in (0, 0, 1)
+    )
+    assert torch.equal(first, again) and not torch.equal(first, other)
+    error = (first - plain)[plain.abs().amax(-1) < 0.3]
+    assert error.mean().abs() < 0.02 and abs(error.std() - 0.2) < 0.01
+    assert first.abs().max() <= 1.0

@@ -47,8 +47,13 @@ def _named(prefix: str, values: Vehicles | Lanes) -> State:
 
 
 def scenes_last(state: State) -> State:
-    """The same tensors [B, ...], laid out so that the scenes are side by side in memory."""
-    return {k: v.movedim(0, -1).contiguous().movedim(-1, 0) for k, v in state.items()}
+    """The same tensors [B, ...], laid out so that the scenes are side by side in memory.
+
+    The strides are always the same, also where a dimension is 1 and any would do: to a compiled
+    function other strides are another input.
+    """
+    turned = {key: value.movedim(0, -1) for key, value in state.items()}
+    return {k: v.reshape(-1).reshape(v.shape).movedim(-1, 0) for k, v in turned.items()}
 
 
 def _lanes(state: State, whose: str) -> Lanes:
@@ -110,12 +115,11 @@ def restart(scenario: Scenario, state: State, seed: Tensor, reset: Tensor, rows:
     mask = reset[rows]
 
     def merge(old: Tensor, new: Tensor) -> Tensor:
-        # Along the last dimension, or the copy would lay the scenes out one after the other.
         old, new = old.movedim(0, -1), new.movedim(0, -1)
         new = torch.where(mask, new, old[..., rows])
         return old.index_copy(-1, rows, new).movedim(-1, 0)
 
-    return {key: merge(old, fresh[key]) for key, old in state.items()}
+    return scenes_last({key: merge(old, fresh[key]) for key, old in state.items()})
 
 
 def _respawn(scenario: Scenario, vehicles: Vehicles, state: State) -> Vehicles:
@@ -208,7 +212,7 @@ def advance(scenario: Scenario, state: State, action: Tensor) -> tuple[State, St
     )  # fmt: skip
     terminated = off | collision | success
     truncated = (after["steps"] >= scenario.horizon) | (after["still"] >= scenario.patience)
-    return after, {
+    return scenes_last(after), {
         "collision": collision, "offroad": off, "success": success, "reward": reward, "cost": cost,
         "terminated": terminated, "truncated": truncated, "done": terminated | truncated,
     }  # fmt: skip
