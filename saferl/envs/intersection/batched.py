@@ -178,11 +178,12 @@ def advance(scenario: Scenario, state: State, action: Tensor) -> tuple[State, St
     cost = scenario.cost(ego, control, vehicle_states(vehicles, lane), state["within_view"])
 
     time = steps.to(ego.dtype) / scenario.policy_frequency
-    due = steps % scenario.rules_every == 0
     traffic = scenario.traffic.vehicles[1] > 0
     if traffic:
-        vehicles = _choose(due, road_rules(vehicles, lane, own_lane, zone, ego, time), vehicles)
-    collision = torch.zeros_like(due)
+        ruled = road_rules(vehicles, lane, own_lane, zone, ego, time)
+        every = scenario.rules_every
+        vehicles = ruled if every == 1 else _choose(steps % every == 0, ruled, vehicles)
+    collision = torch.zeros_like(steps, dtype=torch.bool)
     for _ in range(SUBSTEPS):  # a collision ends a decision at once
         if traffic:
             moved = move(vehicles, lane, accelerate(vehicles, lane, pair, ego), scenario.dt)

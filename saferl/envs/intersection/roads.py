@@ -17,7 +17,7 @@ class Lanes(NamedTuple):
 
     Attributes:
         x, y, cos, sin, heading: start of the approach (m), its direction and heading (rad).
-        curvature: of the connector through the box, 1/m.
+        side, radius: of the arc through the box: -1 bends left, 1 right, 0 not; m, 1 if straight.
         out: arc length at which the box ends, m.
         out_x, out_y, out_cos, out_sin: the end of the box and the direction there.
         priority, turn_speed, approach: right of way, speed limit in the box (m/s), approach lane.
@@ -28,7 +28,8 @@ class Lanes(NamedTuple):
     cos: Tensor
     sin: Tensor
     heading: Tensor
-    curvature: Tensor
+    side: Tensor
+    radius: Tensor
     out: Tensor
     out_x: Tensor
     out_y: Tensor
@@ -44,10 +45,11 @@ class Lanes(NamedTuple):
 
 
 def _build() -> Constants:
-    """Lanes [16, 14], zones [16, 16, 2] and bodies [4, 16, S, 2] of the routes."""
+    """Lanes [16, 15], zones [16, 16, 2] and bodies [4, 16, S, 2] of the routes."""
     r = routes()
+    radius = 1 / np.where(r.curvature == 0, 1.0, np.abs(r.curvature))
     columns = [
-        *r.start.T, np.cos(r.heading), np.sin(r.heading), r.heading, r.curvature, r.out,
+        *r.start.T, np.cos(r.heading), np.sin(r.heading), r.heading, np.sign(r.curvature), radius, r.out,
         *r.leave.T, np.cos(r.turned), np.sin(r.turned), r.priority, r.turn_speed, r.approach,
     ]  # fmt: skip
     arrays = (np.stack(columns, -1), r.zone, r.body)
@@ -75,10 +77,9 @@ def lane_frames(lane: Lanes, s: Tensor) -> tuple[Frame, Tensor]:
     before = s.clamp_max(ARM)
     half = torch.minimum((s - ARM).clamp_min(0.0), lane.out - ARM) / 2
     after = (s - lane.out).clamp_min(0.0)
-    bend = lane.curvature * half
+    bend = lane.side * half / lane.radius
     c, sn = torch.cos(bend), torch.sin(bend)
-    bent = lane.curvature != 0
-    chord = 2 * torch.where(bent, sn / torch.where(bent, lane.curvature, 1.0), half)
+    chord = 2 * torch.where(lane.side == 0, half, lane.side * lane.radius * sn)
     # Directions at the middle of the arc and at its end.
     mid_cos, mid_sin = lane.cos * c - lane.sin * sn, lane.sin * c + lane.cos * sn
     end_cos, end_sin = mid_cos * c - mid_sin * sn, mid_sin * c + mid_cos * sn
@@ -91,17 +92,15 @@ def lane_project(lane: Lanes, x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     """Arc length and lateral offset (m, positive to the right) of points (x, y) [...] on lanes [...]."""
     dx, dy = x - (lane.x + ARM * lane.cos), y - (lane.y + ARM * lane.sin)
     along, lateral = dx * lane.cos + dy * lane.sin, dy * lane.cos - dx * lane.sin
-    bent, side = lane.curvature != 0, lane.curvature.sign()
-    radius = 1 / torch.where(bent, lane.curvature.abs(), 1.0)
-    inward = radius - side * lateral
-    arc = torch.atan2(along, inward) * radius
-    off = side * (radius - torch.hypot(along, inward))
+    inward = lane.radius - lane.side * lateral
+    arc = torch.atan2(along, inward) * lane.radius
+    off = lane.side * (lane.radius - torch.hypot(along, inward))
     dx, dy = x - lane.out_x, y - lane.out_y
     beyond, right = dx * lane.out_cos + dy * lane.out_sin, dy * lane.out_cos - dx * lane.out_sin
-    inside = bent & (along > 0) & (arc > 0) & (arc < lane.out - ARM) & (beyond < 0)
-    past = bent & (beyond >= 0)
-    s = torch.where(past, lane.out + beyond, ARM + torch.where(inside, arc, along))
-    return s, torch.where(past, right, torch.where(inside, off, lateral))
+    bends = (lane.side != 0) & (along > 0) & (arc < lane.out - ARM)
+    past = beyond >= 0
+    s = torch.where(past, lane.out + beyond, ARM + torch.where(bends, arc, along))
+    return s, torch.where(past, right, torch.where(bends, off, lateral))
 
 
 def pairs(route: Tensor) -> Tensor:

@@ -60,7 +60,7 @@ def vehicle_states(vehicles: Vehicles, lane: Lanes) -> Tensor:
     """States [..., N, 6]: x, y, v_x, 0, phi, omega."""
     place, heading = lane_frames(lane, vehicles.s)
     bends = (vehicles.s > ARM) & (vehicles.s < lane.out)
-    omega = torch.where(bends, vehicles.speed * lane.curvature, 0.0)
+    omega = torch.where(bends, vehicles.speed * lane.side / lane.radius, 0.0)
     states = (place.x, place.y, vehicles.speed, torch.zeros_like(omega), heading, omega)
     return torch.stack(states).movedim((0, 1), (-1, -2))
 
