@@ -64,8 +64,9 @@ class Reward:
 
     def reference(self, ego: Tensor, route: Tensor) -> Tensor:
         """r_ref [...] of the state ``ego`` [..., 6] on ``route`` [...]."""
-        nearest, _, _ = project(ego[..., None, :2], reference_lines(route, ego))
-        x, y, v_x, v_y, phi, omega = ego[..., None, :].unbind(-1)
+        lines = reference_lines(route, ego).movedim(-3, 0)  # the two lines first
+        nearest, _, _ = project(ego[..., :2], lines)
+        x, y, v_x, v_y, phi, omega = ego.unbind(-1)
         metre, speed = (100.0, 20.0) if self.reading == "normalised" else (1.0, 1.0)
         error = (
             (x - nearest[..., 0]) / metre,
@@ -77,7 +78,7 @@ class Reward:
         )
         per_line = sum(w * e.square() for w, e in zip(self.weights, error, strict=True))
         assert isinstance(per_line, Tensor)
-        return per_line.amin(-1) if self.reading == "normalised" else per_line.amax(-1)
+        return per_line.amin(0) if self.reading == "normalised" else per_line.amax(0)
 
     def terms(
         self,

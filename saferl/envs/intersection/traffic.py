@@ -166,7 +166,8 @@ def _gap(
     """[N, T, ...]: the smallest separation of i and j within 2 s, m, both along their routes at constant
     speed; the ego keeps its distance and angle to its route."""
     times = torch.tensor(TIMES, dtype=s.dtype, device=s.device).reshape(-1, *[1] * s.ndim)
-    path, _ = lane_frames(lane, s + pace * times)  # [times, N, ...]
+    # [times, N, ...], stacked so that a compiler keeps them and does not redo them for every pair.
+    path = Frame(*torch.stack(lane_frames(lane, s + pace * times)[0]))
     size = (STRETCH * LENGTH, WIDTH)
     # Every pair once, then its number at both of its places; no vehicle meets itself.
     count = len(s)
