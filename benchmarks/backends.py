@@ -70,7 +70,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("runs", type=Path, nargs="*", metavar="RUN")
     parser.add_argument("--episodes", type=int, default=500)
-    parser.add_argument("--tasks", nargs="+", choices=("lt", "gs", "rt"), default=["lt", "gs", "rt"])
+    parser.add_argument(
+        "--tasks", nargs="+", choices=("lt", "gs", "rt"), default=["lt", "gs", "rt"]
+    )
     parser.add_argument("--drivers", nargs="*", choices=list(DRIVERS), default=list(DRIVERS))
     parser.add_argument("--json", type=Path, help="write the figures here")
     options = parser.parse_args()
@@ -87,7 +89,10 @@ def main() -> None:
     result: dict[str, Any] = {"episodes": options.episodes, "rates": {}, "transfer": {}}
     failed, compared, same, played = 0, 0, 0, 0
     n = options.episodes
-    print(f"{n} episodes each{'':4s}" + "".join(f"{rate + ' % (batched / highway)':>36s}" for rate in RATES))
+    print(
+        f"{n} episodes each{'':4s}"
+        + "".join(f"{rate + ' % (batched / highway)':>36s}" for rate in RATES)
+    )
     for name, (policy, transforms, settings) in policies.items():
         total = dict.fromkeys(BACKENDS, 0)
         for task in options.tasks:

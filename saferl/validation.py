@@ -80,9 +80,7 @@ def check_training(cfg: DictConfig) -> None:
             raise ValueError(f"lr.{name} must be [first, last], both >= 0, got {rates!r}.")
     for key in ("batch_size", "demonstrations"):
         if cfg.buffer_size < cfg[key]:
-            raise ValueError(
-                f"buffer_size must be >= {key}, got {cfg.buffer_size} and {cfg[key]}."
-            )
+            raise ValueError(f"buffer_size must be >= {key}, got {cfg.buffer_size} and {cfg[key]}.")
     check_targets(cfg)
 
 

@@ -67,7 +67,9 @@ def test_demonstrations_fill_the_buffer_before_the_first_frame(tmp_path: Path):
     trainer.demonstrate, shown = None, trainer.demonstrate()
     assert 101 <= len(shown) < 101 + 2 * trainer.collector.env.batch_size[0]
     # A mean error of 0.16 is that of the noise.
-    for half, driver in zip(shown.split(len(shown) // 2), (CautiousDriver(), Driver()), strict=True):
+    for half, driver in zip(
+        shown.split(len(shown) // 2), (CautiousDriver(), Driver()), strict=True
+    ):
         error = half["action"] - driver(half.clone())["action"]
         assert error.abs().mean() < 0.17
     trainer.demonstrate = lambda: shown

@@ -16,10 +16,12 @@ from saferl.envs.intersection.geometry import (
     wrap,
 )
 from saferl.envs.intersection.spawning import mix, uniform
+from saferl.envs.intersection.traffic import STOP
 
 CRUISE = 9.0  # m/s
 _LATERAL = 4.5  # m/s^2, the most that a driver asks of a bend
 _BRAKE = 3.0  # m/s^2, comfortable
+_NARROW = 1.1  # enlargement of the rectangles of standing vehicles
 
 
 class Driver(TensorDictModuleBase):
@@ -77,12 +79,12 @@ class CautiousDriver(Driver):
 
     Every choice of speed is played forward along the line for 4 s against the observed vehicles at
     constant velocity, all rectangles enlarged; the fastest choice that hits nobody is taken, and the
-    hardest braking if every one does. It knows no entry line, and stops inside the box more often than
-    before it.
+    hardest braking if every one does. Before the box it takes full speed or none: it stops at the
+    line, rather than creep into the way of others.
 
     Args:
         speed: m/s, of the free road.
-        margin: enlargement of the predicted rectangles.
+        margin: enlargement of the predicted rectangles of moving vehicles.
     """
 
     choices = (1.0, 0.66, 0.33, 0.0)  # of the free speed
@@ -112,10 +114,17 @@ class CautiousDriver(Driver):
         other = torch.cat([moved, heading], -1).transpose(-3, -2)[
             ..., None, :, :, :
         ]  # [*B, 1, T, M, 3]
-        hit = overlap(pose[..., None, :], other, scale=self.margin)
+        # Room for what may change: less of it beside a car that stands and waits.
+        moving = (speed.norm(dim=-1) / 2.0).clamp_max(1.0)[..., None, None, :]  # [*B, 1, 1, M]
+        scale = _NARROW + (self.margin - _NARROW) * moving
+        hit = overlap(pose[..., None, :], other, scale=scale)
         hit &= vehicles[..., None, None, :, 0] > 0.5
         free_choice = ~hit.flatten(-2).any(-1)
-        return torch.where(free_choice, choice, 0.0).amax(-1)
+        fastest = torch.where(free_choice, choice, 0.0).amax(-1)
+        to_line = STOP - s
+        halting = torch.sqrt(2 * _BRAKE * to_line.clamp_min(0.0))
+        waits = (to_line > 0) & ~free_choice[..., 0]
+        return torch.where(waits, torch.minimum(fastest, halting), fastest)
 
 
 def _world_velocity(ego: Tensor) -> Tensor:
