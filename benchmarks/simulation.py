@@ -1,7 +1,7 @@
 """Decisions per second of the batched intersection beside highway-env's own, in one process.
 
     python benchmarks/simulation.py [--batches 1 256 1024 4096] [--device cpu] [--rounds 5]
-        [--seconds 3] [--clock wall] [--json PATH]
+        [--seconds 3] [--clock wall] [--soak 0] [--json PATH]
 
 A decision is whole on both sides: yielding, three substeps, observation, reward, and resets; ours
 adds the cost. Stock ``intersection-v1`` runs at 15 Hz with 5 decisions per second and 10 vehicles,
@@ -9,6 +9,9 @@ ours the nominal traffic with 10 vehicles, both with random actions; every envir
 ``step_and_maybe_reset``, TorchRL's overhead included. The rounds alternate, so that a changing load
 meets all alike. Prints medians, their ratios to stock, the time to the first step, and the memory of
 the states. On a machine that is busy with other work ``--clock cpu`` counts this process's own time.
+
+``--soak 10000000`` then makes so many decisions in a row, compiled, at the last of the batches, looks
+at every number of every step for one that is not finite, and prints the process's memory on the way.
 """
 
 from __future__ import annotations
@@ -53,7 +56,7 @@ class Ours:
         begin = time.perf_counter()
         scenario = Scenario(task="mixed")
         self.env = BatchedIntersection(scenario, batch, device=device, compile_physics=compiled)
-        self.batch, self.device = batch, device
+        self.batch, self.compiled, self.device = batch, compiled, device
         self.generator = torch.Generator(device).manual_seed(0)
         self.data = self.env.reset()
         self()
@@ -66,6 +69,29 @@ class Ours:
         self.data["action"] = 2 * noise - 1
         _, self.data = self.env.step_and_maybe_reset(self.data)
         return self.batch
+
+
+def resident() -> float:
+    """Memory of this process, MB."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def soak(one: Ours, decisions: int) -> dict[str, float]:
+    """Decisions in a row; the process's memory after a tenth of them and at the end, MB."""
+    done, memory, marks = 0, {}, [decisions // 10, decisions]
+    while done < decisions:
+        done += one()
+        wrong = [
+            key
+            for key, value in one.data.items(True, True)
+            if value.is_floating_point() and not bool(value.isfinite().all())
+        ]
+        if wrong:
+            raise SystemExit(f"Not finite after {done} decisions: {wrong}.")
+        if done >= marks[0]:
+            memory[f"MB_after_{marks.pop(0)}"] = resident()
+    return memory
 
 
 def rate(decide: Callable[[], int], seconds: float, clock: str, device: str) -> float:
@@ -85,6 +111,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=3.0, help="of each in a round")
     parser.add_argument("--clock", choices=list(CLOCKS), default="wall")
+    parser.add_argument("--soak", type=int, default=0, metavar="DECISIONS")
     parser.add_argument("--json", type=Path, help="write the figures here")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -114,6 +141,8 @@ def main() -> None:
             f"{one.name:16s}{speed:12.0f}{ratio:8.0f}{1e6 / speed:9.1f}{one.first_step:10.1f} s"
             f"{one.megabytes:6.1f} MB"
         )
+        kind = "compiled" if one.compiled else "eager"
+        result[f"ratio_{kind}_{one.batch}"] = ratio
         result[one.name] = {
             "decisions_per_second": speed,
             "ratio": ratio,
@@ -124,6 +153,10 @@ def main() -> None:
         print(
             f"{torch.cuda.get_device_name()}: peak {torch.cuda.max_memory_allocated() / 2**20:.0f} MB"
         )
+    if options.soak:
+        result["soak"] = soak(ours[-1], options.soak)
+        memory = ", ".join(f"{key} {value:.0f}" for key, value in result["soak"].items())
+        print(f"{options.soak} decisions, {ours[-1].name}: every number finite, {memory}")
     if options.json:
         options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(json.dumps(result, indent=2) + "\n")
