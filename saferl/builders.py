@@ -83,7 +83,7 @@ def demonstrate(cfg: DictConfig, scenario: Scenario) -> TensorDict:
         data = env.rollout(steps, driver, break_when_any_done=False).reshape(-1)
         parts.append(data.set(("next", "action_executed"), data["action"].clone()))
         env.close()
-    return TensorDict.cat(parts)
+    return TensorDict.cat(parts)  # pyright: ignore[reportReturnType]
 
 
 @dataclass
