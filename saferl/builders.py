@@ -11,22 +11,25 @@ import hydra
 import torch
 from omegaconf import DictConfig
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import EnvBase, RewardScaling, RewardSum, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import LossModule, SoftUpdate
 
 from saferl.checkpoint import latest, load_component, run_config
 from saferl.components import Fitting, Networks
 from saferl.envs.intersection import Scenario
-from saferl.envs.intersection.drivers import CautiousDriver, Driver, NoisyDriver
+from saferl.envs.intersection.drivers import CautiousDriver, Driver
 from saferl.envs.transforms import ExecutedAction, SafetyProjector
 from saferl.hooks import ProjectorProgress
 from saferl.learner import Learner
 from saferl.modules import tanh_gaussian_actor, value_operator, zero_output
-from saferl.trainer import Budget, Trainer
+from saferl.progress import Budget
+from saferl.trainer import Trainer
 from saferl.validation import check_training
 
 #: What the replay buffer keeps of a transition.
@@ -79,8 +82,10 @@ def demonstrate(cfg: DictConfig, scenario: Scenario) -> TensorDict:
     steps = -(-cfg.demonstrations // (2 * num_envs))
     for number, driver in enumerate((CautiousDriver(), Driver())):
         env = build_env(cfg, scenario, num_envs, cfg.seed + 1 + number)
-        driver = NoisyDriver(driver, std=0.2, seed=cfg.seed)
-        data = env.rollout(steps, driver, break_when_any_done=False).reshape(-1)
+        noise = AdditiveGaussianModule(env.action_spec, sigma_init=0.2, sigma_end=0.2)
+        policy = TensorDictSequential([driver, noise.to(env.device)])
+        with set_exploration_type(ExplorationType.RANDOM):
+            data = env.rollout(steps, policy, break_when_any_done=False).reshape(-1)
         parts.append(data.set(("next", "action_executed"), data["action"].clone()))
         env.close()
     return TensorDict.cat(parts)  # pyright: ignore[reportReturnType]

@@ -23,7 +23,7 @@ from saferl.evaluation import TEST, as_test, envs_at_once, write
 from saferl.evaluation import evaluate as play_episodes
 from saferl.metrics import table
 from saferl.paths import pretrained_run
-from saferl.trainer import Budget
+from saferl.progress import Budget
 from saferl.validation import check_testing
 
 log = logging.getLogger(__name__)
@@ -56,6 +56,8 @@ def train(cfg: DictConfig) -> None:
             (run / CONFIG).unlink(missing_ok=True)
 
     settings = cfg.evaluation
+    if "compile_physics" in cfg.env:  # the closing test is over before compiling would pay
+        cfg = OmegaConf.merge(cfg, {"env": {"compile_physics": False}})  # pyright: ignore
     try:
         measure(
             cfg,
@@ -163,7 +165,9 @@ def on_its_own_task(cfg: DictConfig, trained: DictConfig, overrides: Sequence[st
     rate = {"policy_frequency": trained.evaluation.policy_frequency}
     test.task = OmegaConf.merge(trained.task, TEST, rate)
     if "env" not in keys:
-        test.env = OmegaConf.merge(trained.env, {"num_envs": cfg.env.num_envs})
+        # The backend is the run's; what the backends set alike, or this one sets too, is the test's.
+        shared = {k: v for k, v in cfg.env.items() if k in trained.env and k != "_target_"}
+        test.env = OmegaConf.merge(trained.env, shared)
     for key in keys:
         key = "task.task" if key == "task" else key
         if key.startswith(("task.", "env.")):
@@ -222,8 +226,6 @@ def measure(
 ) -> list[dict]:
     """Play, write ``metrics.json`` and ``episodes.csv``, report the table; returns the rows."""
     most = scenario.traffic.vehicles[1]
-    if "compile_physics" in cfg.env:  # a test is over before it pays
-        cfg = OmegaConf.merge(cfg, {"env": {"compile_physics": False}})  # pyright: ignore
     env = build_env(cfg, scenario, envs_at_once(episodes, num_envs), seed, *transforms)
     rows = play_episodes(policy, env, episodes, seed)
     for transform in transforms:  # free for another environment

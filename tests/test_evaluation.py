@@ -207,6 +207,20 @@ def test_the_command_line_alone_changes_a_runs_own_task():
     assert cfg.env._target_.endswith("HighwayIntersection") and cfg.env.num_envs == 3
 
 
+@pytest.mark.parametrize("backend", ["batched", "highway"])
+def test_a_test_takes_the_runs_backend_and_sets_it_itself(backend: str):
+    """A run of 256 compiled environments is not compiled again to be tested, unless asked for."""
+    compiles = ("env.compile_physics=true",) if backend == "batched" else ()
+    trained = compose("algo=sac", f"env={backend}", "env.num_envs=256", *compiles)
+    OmegaConf.set_struct(trained, False)  # as a run's own file is read
+    cfg = on_its_own_task(compose(config="evaluate"), trained, ())
+    assert cfg.env._target_ == trained.env._target_ and cfg.env.num_envs == 100
+    assert not cfg.env.get("compile_physics", False)
+    if compiles:
+        cfg = on_its_own_task(compose(*compiles, config="evaluate"), trained, compiles)
+        assert cfg.env.compile_physics
+
+
 def test_a_checkpoints_projector_acts_as_it_did_in_training(tmp_path: Path):
     """Not at all before its start, in an exported policy as in the run."""
     cfg = compose(*SMALL, *EMPTY, "algo=rsac", "projector.start=0.5")

@@ -27,7 +27,8 @@ from saferl.envs.intersection.drivers import CautiousDriver, Driver
 from saferl.hooks import CriticSignal, EpisodeSignal, episode_budget
 from saferl.metrics import EpisodeWindow
 from saferl.paths import config_dir
-from saferl.trainer import Budget, Trainer
+from saferl.progress import Budget
+from saferl.trainer import Trainer
 
 
 def trainer_of(folder: Path, *overrides: str) -> Trainer:
@@ -66,12 +67,12 @@ def test_demonstrations_fill_the_buffer_before_the_first_frame(tmp_path: Path):
     trainer = build_trainer(compose(*SMALL, *options, "env.num_envs=2"), tmp_path)
     trainer.demonstrate, shown = None, trainer.demonstrate()
     assert 101 <= len(shown) < 101 + 2 * trainer.collector.env.batch_size[0]
-    # A mean error of 0.16 is that of the noise.
+    # The mean error of the noise alone is 0.16.
     for half, driver in zip(
         shown.split(len(shown) // 2), (CautiousDriver(), Driver()), strict=True
     ):
         error = half["action"] - driver(half.clone())["action"]
-        assert error.abs().mean() < 0.17
+        assert 0.1 < error.abs().mean() < 0.18
     trainer.demonstrate = lambda: shown
     trainer.train()
     stored = trainer.buffer[:]

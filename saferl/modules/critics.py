@@ -11,7 +11,8 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.modules import ValueOperator
 
-_REDUCTIONS: dict[str, Callable[[Tensor], Tensor]] = {
+#: What may be made of the values of an ensemble's members, [n, *B, 1] -> [*B, 1].
+REDUCTIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "max": lambda values: values.amax(0),
     "min": lambda values: values.amin(0),
     "mean": lambda values: values.mean(0),
@@ -149,8 +150,8 @@ class CriticEnsemble(TensorDictModuleBase):
         action_key: NestedKey = "action",
     ):
         super().__init__()
-        if reduce not in _REDUCTIONS:
-            raise ValueError(f"reduce must be one of {sorted(_REDUCTIONS)}, got {reduce!r}.")
+        if reduce not in REDUCTIONS:
+            raise ValueError(f"reduce must be one of {sorted(REDUCTIONS)}, got {reduce!r}.")
         if isinstance(members, TensorDictModuleBase):
             if params is None:
                 raise ValueError("A template critic needs its stacked params; else pass a list.")
@@ -189,7 +190,7 @@ class CriticEnsemble(TensorDictModuleBase):
         return torch.vmap(self._member, (0, None))(self.params, inputs)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.set(self.out_keys[0], _REDUCTIONS[self.reduce](self.values(tensordict)))
+        return tensordict.set(self.out_keys[0], REDUCTIONS[self.reduce](self.values(tensordict)))
 
     @torch.no_grad()
     def bind(self, tensordict: TensorDictBase) -> Callable[[Tensor], Tensor]:
@@ -214,5 +215,5 @@ class CriticEnsemble(TensorDictModuleBase):
         for params in self.params.data.unbind(0):
             with params.to_module(self.template, preserve_module_state=False):
                 members.append(condition(*scene))
-        reduce = _REDUCTIONS[self.reduce]
+        reduce = REDUCTIONS[self.reduce]
         return lambda action: reduce(torch.stack([member(action) for member in members]))

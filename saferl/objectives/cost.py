@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from copy import deepcopy
 from typing import Any
 
@@ -16,12 +15,10 @@ from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import _cache_values, _vmap_func, distance_loss
 
 from saferl.modules import CriticEnsemble, LagrangeMultiplier
+from saferl.modules.critics import REDUCTIONS
 
-#: What the cost critics' target makes of the values of its members, [n, *B, 1].
-COST_TARGETS: dict[str, Callable[[Tensor], Tensor]] = {
-    "max": lambda values: values.amax(0),
-    "mean": lambda values: values.mean(0),
-}
+#: What the cost critics' target may be of its members' values.
+COST_TARGETS = ("max", "mean")
 
 
 class CostCriticLoss(LossModule):
@@ -206,7 +203,7 @@ class CostCriticLoss(LossModule):
         next_state, _ = next_sample or self._sample_next(tensordict)
         with torch.no_grad():
             next_value = self._cost_values(next_state, self.target_cost_critic_params)
-            next_value = COST_TARGETS[self.cost_target](next_value)
+            next_value = REDUCTIONS[self.cost_target](next_value)
             target = self._cost_value_estimator.value_estimate(
                 tensordict.copy(), next_value=next_value
             )

@@ -1,60 +1,28 @@
-"""The batched environment: specs, seeds, partial resets, ends of episodes, state."""
+"""The batched environment: specs, seeds, partial resets, state."""
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
-from tensordict import TensorDict
+from batch import (
+    COAST,
+    OBSERVATION,
+    equal,
+    make,
+    noise,
+    reset,
+    reset_rows,
+    step,
+)
 from torchrl.envs.utils import check_env_specs
 
 from saferl.envs.intersection import BatchedIntersection, Scenario
 from saferl.envs.intersection.base import OUTCOMES
-from saferl.envs.intersection.geometry import ROUTES, ROUTES_OF_TASK, project, reference_lines
 from saferl.envs.intersection.spawning import (
-    draw_route,
-    draw_start,
     episode_seeds,
     mix,
     uniform,
 )
-
-NORTH = -math.pi / 2
-OBSERVATION = ("ego", "vehicles", "route", *OUTCOMES)
-COAST, BRAKE, HARD_LEFT = (0.0, 0.0), (-1.0, 0.0), (0.0, -1.0)
-
-
-def make(num_envs=1, seed=0, **settings):
-    return BatchedIntersection(Scenario(**{"vehicles": 0} | settings), num_envs, seed)
-
-
-def reset(env, seeds=None):
-    """Reset all environments, maybe to given episodes."""
-    fields = {"seed": torch.as_tensor(seeds)} if seeds is not None else {}
-    return env.reset(TensorDict(fields, batch_size=env.batch_size))
-
-
-def reset_rows(env, view, rows):
-    """Reset the environments in the mask ``rows``; ``view`` is what the last step gave."""
-    mask = torch.as_tensor(rows).reshape(*env.batch_size, 1)
-    return env.reset(view.exclude("reward", "cost").set("_reset", mask))
-
-
-def step(env, action):
-    """One step of all environments with ``action`` [2] or [B, 2]."""
-    action = torch.as_tensor(action).expand(*env.batch_size, 2)
-    return env.step(TensorDict({"action": action}, batch_size=env.batch_size))["next"]
-
-
-def equal(a, b, keys=OBSERVATION):
-    return all(torch.equal(a[key], b[key]) for key in keys)
-
-
-def noise(count, *shape, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    return torch.rand((count, *shape, 2), generator=generator) * 2 - 1
-
 
 # --- specs ---------------------------------------------------------------------------------------
 
@@ -190,50 +158,6 @@ def test_mix_is_splitmix64():
     ]
 
 
-# --- starts --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("task", ["lt", "gs", "rt", "mixed"])
-def test_starts_are_forty_metres_before_the_box_in_the_lane_of_the_route(task):
-    env = make(2000, task=task, seed=2)
-    view = reset(env)
-    route, ego = view["route"].squeeze(-1), view["ego"]
-    assert set(route.tolist()) == set(ROUTES_OF_TASK[task])
-    lanes = {"lt": 2.0, "gs_inner": 2.0, "gs_outer": 6.0, "rt": 6.0}
-    lane = torch.tensor([lanes[name] for name in ROUTES])
-    assert torch.equal(ego[:, 1], lane[route])
-    assert torch.allclose(ego[:, 5], torch.tensor(NORTH))
-    assert (ego[:, [4, 6]] == 0).all()
-    for column, low, high in ((2, 50.0, 60.0), (3, 6.0, 10.0)):
-        values = (ego[:, column].sort().values - low) / (high - low)
-        expected = (torch.arange(2000) + 0.5) / 2000
-        assert values[0] >= 0 and values[-1] <= 1
-        assert (values - expected).abs().max() < 0.05
-    if task == "mixed":
-        share = torch.bincount(route, minlength=4) / 2000
-        assert (share - torch.tensor([2, 1, 1, 2]) / 6).abs().max() < 0.04
-
-
-@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
-def test_route_starts_spread_their_share_along_the_route(share):
-    seeds = episode_seeds(1, 4000)
-    route = draw_route("mixed", seeds)
-    state = draw_start(route, seeds, share)
-    lines = reference_lines(route, state)[:, 0]
-    pose, s, distance = project(state[:, :2], lines)
-    assert distance.max() < 1e-9 and torch.allclose(pose[:, 2], state[:, 4])
-    start, goal = 55.0, lines[:, 3, 5] + 25.0
-    assert (s >= start - 1e-9).all() and (s <= goal + 1e-9).all()
-    beyond = s > 65.0
-    # Uniform over the route: what lies beyond the usual 10 m of starts.
-    expected = share * (1 - (10.0 / (goal - start)).mean())
-    assert abs(beyond.double().mean() - expected) < 0.03
-    if share:
-        place = ((s - 65.0) / (goal - 65.0))[beyond].sort().values
-        uniform_place = (torch.arange(len(place)) + 0.5) / len(place)
-        assert (place - uniform_place).abs().max() < 0.05
-
-
 # --- partial resets ------------------------------------------------------------------------------
 
 
@@ -281,107 +205,6 @@ def test_rollout_resets_what_has_ended():
     follows = torch.isclose(data["ego"][:, 1:], data["next", "ego"][:, :-1]).all(-1)
     assert torch.equal(follows, ~done[:, :-1])
     assert (data["ego"][:, 1:][done[:, :-1]][:, 2] >= 50.0).all()
-
-
-# --- ends of episodes ----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("frequency", "decisions"), [(5, 125), (10, 250)])
-def test_an_episode_is_truncated_after_25_seconds(frequency, decisions):
-    env = make(3, policy_frequency=frequency)
-    reset(env)
-    for k in range(1, decisions + 1):
-        view = step(env, BRAKE)
-        assert view["truncated"].all() == (k == decisions), k
-        assert torch.equal(view["done"], view["truncated"])
-        assert not view["terminated"].any()
-
-
-@pytest.mark.parametrize("frequency", [5, 10])
-def test_a_decision_lasts_as_long_as_the_clock_says(frequency):
-    """Straight on at constant speed: 9 m/s for a second are 9 m."""
-    env = make(1, task="gs", policy_frequency=frequency)
-    view = reset(env)
-    y, speed = view["ego"][0, 2].item(), view["ego"][0, 3].item()
-    for _ in range(frequency):
-        view = step(env, COAST)
-    assert view["ego"][0, 2].item() == pytest.approx(y - speed, abs=1e-4)
-
-
-@pytest.mark.parametrize("frequency", [5, 10])
-def test_a_car_that_stands_still_is_truncated_in_its_time(frequency):
-    env = make(1, task="gs", standstill=2.0, policy_frequency=frequency)
-    speed = reset(env)["ego"][0, 3].item()
-    still = 0
-    # Brakes to a stop, waits 1.6 s, drives for a moment, brakes again and waits.
-    plan = [BRAKE] * math.ceil(frequency * speed / 5.0) + [BRAKE] * int(1.6 * frequency)
-    plan += [(1.0, 0.0)] * 2 + [BRAKE] * (4 * frequency)
-    for action in plan:
-        view = step(env, action)
-        speed = max(speed + action[0] * 5.0 / frequency, 0.0)
-        assert view["ego"][0, 3].item() == pytest.approx(speed, abs=1e-4)
-        still = still + 1 if speed < 0.3 else 0
-        assert view["truncated"].item() == (still >= 2 * frequency)
-        assert not view["terminated"].item()
-        if view["truncated"].item():
-            break
-    assert still == 2 * frequency
-
-
-def test_leaving_the_road_terminates():
-    env = make(5, task="mixed")
-    reset(env)
-    for _ in range(20):
-        view = step(env, HARD_LEFT)
-        off = view["offroad"]
-        assert torch.equal(view["terminated"], off) and torch.equal(view["done"], off)
-        assert (view["reward"][off] < -40).all() and (view["reward"][~off] > -10).all()
-        assert not view["collision"].any() and not view["success"].any()
-        if off.any():
-            break
-    assert off.any()
-
-
-def test_a_crash_in_the_last_decision_is_terminated():
-    def crash(duration):
-        env = make(1, task="gs", duration=duration)
-        reset(env, [11])
-        for k in range(1, 30):
-            view = step(env, HARD_LEFT)
-            if view["done"]:
-                return k, view
-
-    decisions, free = crash(25.0)
-    assert free["terminated"] and not free["truncated"]
-    last, view = crash(decisions / 5)
-    assert last == decisions
-    assert view["terminated"] and view["offroad"] and view["done"]
-    assert torch.equal(view["reward"], free["reward"])
-    last, view = crash((decisions - 1) / 5)
-    assert last == decisions - 1
-    assert view["truncated"] and not view["terminated"] and not view["offroad"]
-
-
-def test_arriving_terminates_with_success():
-    env = make(6, task="gs", seed=1)
-    reset(env)
-    for _ in range(60):
-        view = step(env, (0.2, 0.0))
-        ego, success = view["ego"], view["success"].squeeze(-1)
-        assert torch.equal(success, ego[:, 2] <= -40.0)
-        assert torch.equal(view["terminated"].squeeze(-1), success)
-        assert (view["reward"].squeeze(-1)[success] > 90).all()
-        if success.any():
-            break
-    assert success.any()
-    assert (view["cost"] == 0).all(), "an empty road costs nothing"
-
-
-def test_actions_beyond_the_box_are_clipped():
-    env = make(2)
-    reset(env, [3, 3])
-    view = step(env, torch.tensor([[1.0, -1.0], [7.0, -3.0]]))
-    assert torch.equal(view["ego"][0], view["ego"][1])
 
 
 # --- state ---------------------------------------------------------------------------------------

@@ -134,30 +134,6 @@ def _world_velocity(ego: Tensor) -> Tensor:
     )
 
 
-class NoisyDriver(Driver):
-    """Another driver with Gaussian noise on its action, to show a learner what lies around it.
-
-    Args:
-        driver: the other one.
-        std: of the noise, in units of the action [-1, 1].
-        seed: of the noise.
-    """
-
-    def __init__(self, driver: Driver, std: float, seed: int = 0):
-        super().__init__(driver.speed)
-        self.driver, self.std, self.seed = driver, std, seed
-        self._noise: torch.Generator | None = None
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = self.driver(tensordict)["action"]
-        if self._noise is None:
-            self._noise = torch.Generator(action.device).manual_seed(self.seed)
-        noise = torch.randn(
-            action.shape, generator=self._noise, device=action.device, dtype=action.dtype
-        )
-        return tensordict.set("action", (action + self.std * noise).clamp(-1.0, 1.0))
-
-
 class RandomDriver(Driver):
     """Uniform random actions, the floor of every table.
 
