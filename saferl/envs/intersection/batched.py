@@ -169,7 +169,8 @@ def advance(scenario: Scenario, state: State, action: Tensor) -> tuple[State, St
     Returns:
         The next state; and outcomes, ``reward``, ``cost`` and ends, each [B].
     """
-    control = to_physical(action)
+    # Laid out like the rest: the action that comes in is not.
+    control = columns(*to_physical(action).unbind(-1))
     ego, route, steps, vehicles = state["ego"], state["route"], state["steps"], vehicles_of(state)
     previous = torch.where(steps[:, None] == 0, control, state["control"])
     lane, own_lane = _lanes(state, _LANE), _lanes(state, _OWN)
