@@ -1,15 +1,23 @@
 """Networks, critics, multipliers and the projection that algorithms are composed of."""
 
 from saferl.modules.actors import GaussianHead, tanh_gaussian_actor
-from saferl.modules.critics import CriticEnsemble, StateValue, value_operator, zero_output
+from saferl.modules.critics import (
+    BoundCritics,
+    CriticEnsemble,
+    StateValue,
+    value_operator,
+    zero_output,
+)
 from saferl.modules.lagrange import DualAscent, LagrangeMultiplier, PIDMultiplier
 from saferl.modules.mlp import MLPPolicyEncoder, MLPValue
 from saferl.modules.mmam import EGO_SCALE, VEHICLE_SCALE, MMAMPolicyEncoder, MMAMValue
+from saferl.modules.plain import PlainMMAMPolicyEncoder, PlainMMAMValue
 from saferl.modules.projection import ProjectionResult, project
 
 __all__ = [
     "EGO_SCALE",
     "VEHICLE_SCALE",
+    "BoundCritics",
     "CriticEnsemble",
     "DualAscent",
     "GaussianHead",
@@ -19,6 +27,8 @@ __all__ = [
     "MMAMPolicyEncoder",
     "MMAMValue",
     "PIDMultiplier",
+    "PlainMMAMPolicyEncoder",
+    "PlainMMAMValue",
     "ProjectionResult",
     "StateValue",
     "project",

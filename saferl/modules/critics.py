@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
+from torch.utils._pytree import tree_map
 from torchrl.modules import ValueOperator
 
 #: What may be made of the values of an ensemble's members, [n, *B, 1] -> [*B, 1].
@@ -98,6 +101,98 @@ def value_operator(
     return ValueOperator(network, in_keys=list(in_keys), out_keys=[out_key])
 
 
+@dataclass(frozen=True)
+class BoundCritics:
+    """Critics with stacked parameters in given states: values as functions of the action alone.
+
+    A network with ``encode(*scene)`` and ``value(encoded, action)``, as :class:`MMAMValue` and
+    :class:`MLPValue` are, is split: what no action changes is computed once, by :meth:`of`, for any
+    number of actions. Any other critic is evaluated whole for each action.
+
+    Attributes:
+        template: a critic, whose structure alone is used.
+        params: the parameters and buffers of all members, with batch size [n].
+        scene: the states as the members encode them, or the entries that they read.
+        reduce: ``"max"``, ``"min"`` or ``"mean"``, what a call makes of the members' values.
+        action_key: the entry that the action is for critics that are not split.
+        vmap: whether the members are evaluated at once, or else one by one.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from saferl.modules import BoundCritics, MLPValue, value_operator
+        >>> critics = [value_operator(MLPValue(rows=3)) for _ in range(2)]
+        >>> params = TensorDict.from_modules(*critics, as_module=True, expand_identical=True)
+        >>> states = TensorDict(ego=torch.randn(5, 9), vehicles=torch.zeros(5, 3, 6), batch_size=5)
+        >>> bound = BoundCritics.of(critics[0], params, states)
+        >>> bound.values(torch.zeros(5, 2)).shape, bound(torch.zeros(5, 2)).shape
+        (torch.Size([2, 5, 1]), torch.Size([5, 1]))
+    """
+
+    template: TensorDictModuleBase
+    params: TensorDictBase
+    scene: Any
+    reduce: str = "max"
+    action_key: NestedKey = "action"
+    vmap: bool = True
+
+    @classmethod
+    def of(
+        cls,
+        template: TensorDictModuleBase,
+        params: TensorDictBase,
+        tensordict: TensorDictBase,
+        **options: Any,
+    ) -> BoundCritics:
+        """Binds critics to the states in ``tensordict``, of which the action is not read."""
+        bound = cls(template, params, None, **options)
+        scene_keys = [key for key in template.in_keys if key != bound.action_key]
+        network = getattr(template, "module", None)
+        if hasattr(network, "encode") and template.in_keys[-1] == bound.action_key:
+            scene = bound._each(bound._encode, (0, None), [tensordict.get(k) for k in scene_keys])
+        else:
+            scene = tensordict.select(*scene_keys)
+        return replace(bound, scene=scene)
+
+    def _each(self, function: Callable, in_dims: tuple, *args: Any) -> Any:
+        """``function(params, *args)`` of each member, stacked."""
+        if self.vmap:
+            return torch.vmap(function, in_dims, randomness="different")(self.params, *args)
+        results = []
+        for i, params in enumerate(self.params.unbind(0)):
+            own = [
+                arg if dim is None else tree_map(lambda x, i=i: x[i], arg)
+                for arg, dim in zip(args, in_dims[1:], strict=True)
+            ]
+            results.append(function(params, *own))
+        return tree_map(lambda *parts: torch.stack(parts), *results)
+
+    def _encode(self, params: TensorDictBase, inputs: list[Tensor]) -> Any:
+        with params.to_module(self.template, preserve_module_state=False):
+            return self.template.module.encode(*inputs)  # pyright: ignore
+
+    def _value(self, params: TensorDictBase, scene: Any, action: Tensor) -> Tensor:
+        with params.to_module(self.template, preserve_module_state=False):
+            if isinstance(scene, TensorDictBase):
+                output = self.template(scene.copy().set(self.action_key, action))
+                return output.get(self.template.out_keys[0])
+            return self.template.module.value(scene, action)  # pyright: ignore
+
+    def values(self, action: Tensor) -> Tensor:
+        """The value of each member, [n, *B, 1], for actions [*B, A]."""
+        whole = isinstance(self.scene, TensorDictBase)
+        return self._each(self._value, (0, None if whole else 0, None), self.scene, action)
+
+    def __call__(self, action: Tensor) -> Tensor:
+        """The members' values reduced to one, [*B, 1]."""
+        return REDUCTIONS[self.reduce](self.values(action))
+
+    def detach(self) -> BoundCritics:
+        """The same, differentiable with respect to the action alone."""
+        scene = tree_map(Tensor.detach, self.scene)
+        return replace(self, params=self.params.detach(), scene=scene)
+
+
 class CriticEnsemble(TensorDictModuleBase):
     """Several critics with stacked parameters, evaluated at once and reduced to one value.
 
@@ -180,40 +275,22 @@ class CriticEnsemble(TensorDictModuleBase):
         self.in_keys = list(template.in_keys)
         self.out_keys = [template.out_keys[0]]
 
-    def _member(self, params: TensorDictBase, tensordict: TensorDictBase) -> Tensor:
-        with params.to_module(self.template, preserve_module_state=False):
-            return self.template(tensordict.copy()).get(self.out_keys[0])
+    def bind(self, tensordict: TensorDictBase) -> BoundCritics:
+        """The reduced value in these states as a function of the action alone, [*B, A] -> [*B, 1].
+
+        Reads the members' ``in_keys`` but for the action. It is valid until the parameters change.
+        """
+        return BoundCritics.of(
+            self.template,
+            self.params,
+            tensordict,
+            reduce=self.reduce,
+            action_key=self.action_key,
+        )
 
     def values(self, tensordict: TensorDictBase) -> Tensor:
         """The value of each member, [n, *B, 1]; writes nothing."""
-        inputs = tensordict.select(*self.in_keys)
-        return torch.vmap(self._member, (0, None))(self.params, inputs)
+        return self.bind(tensordict).values(tensordict.get(self.action_key))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.set(self.out_keys[0], REDUCTIONS[self.reduce](self.values(tensordict)))
-
-    @torch.no_grad()
-    def bind(self, tensordict: TensorDictBase) -> Callable[[Tensor], Tensor]:
-        """The reduced value as a function of the action alone, [*B, A] -> [*B, 1].
-
-        All that does not depend on the action is computed here, once, if the network has a
-        ``condition`` method (as :class:`MMAMValue` and :class:`MLPValue` do). The function can be
-        differentiated with respect to the action, not the parameters, and is valid until these
-        change.
-
-        Reads the members' ``in_keys`` but for the action.
-        """
-        network = getattr(self.template, "module", None)
-        condition = getattr(network, "condition", None)
-        if self.in_keys[-1] != self.action_key or condition is None:
-            scene = tensordict.select(*(key for key in self.in_keys if key != self.action_key))
-            return lambda action: self(scene.copy().set(self.action_key, action)).get(
-                self.out_keys[0]
-            )
-        scene = [tensordict.get(key) for key in self.in_keys[:-1]]
-        members = []
-        for params in self.params.data.unbind(0):
-            with params.to_module(self.template, preserve_module_state=False):
-                members.append(condition(*scene))
-        reduce = REDUCTIONS[self.reduce]
-        return lambda action: reduce(torch.stack([member(action) for member in members]))

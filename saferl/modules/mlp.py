@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -130,25 +130,17 @@ class MLPValue(nn.Module):
         sizes = [width] * (depth - 1) + [1]
         self.layers = nn.ModuleList(nn.Linear(width, size) for size in sizes)
 
-    def condition(self, ego: Tensor, vehicles: Tensor) -> Callable[[Tensor], Tensor]:
-        """The value as a function of the action alone, [*B, A] -> [*B, 1], in this scene.
+    def encode(self, ego: Tensor, vehicles: Tensor) -> dict[str, Tensor]:
+        """What :meth:`value` needs to know of the scene: the first layer's sum over it."""
+        on_scene = self.first.weight[:, : self.scene.size]
+        return {"first": F.linear(self.scene(ego, vehicles), on_scene, self.first.bias)}
 
-        The function holds the tensors that the module has now, not the module, so it stays valid
-        when a functional call puts the module's own parameters back.
-        """
-        on_scene, on_action = self.first.weight.tensor_split([self.scene.size], dim=-1)
-        scene = F.linear(self.scene(ego, vehicles), on_scene, self.first.bias)
-        linear = [layer for layer in self.layers if isinstance(layer, nn.Linear)]
-        weights = [(layer.weight, layer.bias) for layer in linear]
-        activation = self.activation
-
-        def value(action: Tensor) -> Tensor:
-            hidden = scene + F.linear(action, on_action)
-            for weight, bias in weights:
-                hidden = F.linear(activation(hidden), weight, bias)
-            return hidden
-
-        return value
+    def value(self, scene: dict[str, Tensor], action: Tensor) -> Tensor:
+        """The value of ``action`` [*B, A] in the states of ``scene``, [*B, 1]."""
+        hidden = scene["first"] + F.linear(action, self.first.weight[:, self.scene.size :])
+        for layer in self.layers:
+            hidden = layer(self.activation(hidden))
+        return hidden
 
     def forward(self, ego: Tensor, vehicles: Tensor, action: Tensor) -> Tensor:
-        return self.condition(ego, vehicles)(action)
+        return self.value(self.encode(ego, vehicles), action)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -134,10 +134,14 @@ class MMAMPolicyEncoder(nn.Module):
 
     The EV and the SVs are embedded apart (linear + GELU) into Z_1; multi-head self-attention over
     all rows is added to Z_1; the EV's row of that sum is then the only query of a multi-head
-    ego-attention over the sum (keys and values from there: ours), which is added to that row and
-    passed through ``depth`` layers (ours: without them an empty road would leave a policy with one
-    hidden layer). The operator T and the W_i of AttnE1 are two linear maps in a row, hence one matrix
-    here. All activations are GELU.
+    ego-attention, which is added to that row and passed through ``depth`` layers (ours: without them
+    an empty road would leave a policy with one hidden layer). The operator T and the W_i of AttnE1
+    are two linear maps in a row, hence one matrix here. All activations are GELU.
+
+    The paper does not say where the keys and values of the second hop come from. With
+    ``keys="attended"`` it is the sum, so that what the SVs mean to each other reaches the EV; with
+    ``keys="embedded"`` it is Z_1, and of the first hop only the EV's row is ever computed, at about
+    a fifth of the arithmetic.
 
     Absent rows (I_veh = 0) are zeroed and get -1e9 before the softmax, so neither the order of the
     SVs nor the number of absent rows matters, and any number of rows works, none included.
@@ -147,6 +151,7 @@ class MMAMPolicyEncoder(nn.Module):
         heads: h, a divisor of ``width``.
         scale: logits are divided by sqrt(d) (``"paper"``, as printed) or sqrt(d / h)
             (``"per_head"``, the usual one).
+        keys: where the second hop looks, ``"attended"`` or ``"embedded"`` (see above).
         depth: layers of ``width`` units after the attention (ours).
         ego_scale: divisors of the ego features; their number is the size of ``ego``.
         vehicle_scale: divisors of a vehicle's features; I_veh comes first.
@@ -154,8 +159,8 @@ class MMAMPolicyEncoder(nn.Module):
     Reads ``ego`` [*B, 9] and ``vehicles`` [*B, M, 6], SI units; returns features [*B, width].
 
     Raises:
-        ValueError: if ``heads`` does not divide ``width``, ``scale`` is unknown, or a feature scale
-            is not positive and finite.
+        ValueError: if ``heads`` does not divide ``width``, ``scale`` or ``keys`` is unknown, or a
+            feature scale is not positive and finite.
 
     Examples:
         >>> import torch
@@ -170,20 +175,30 @@ class MMAMPolicyEncoder(nn.Module):
         width: int = 256,
         heads: int = 4,
         scale: str = "paper",
+        keys: str = "attended",
         depth: int = 2,
         ego_scale: Sequence[float] = EGO_SCALE,
         vehicle_scale: Sequence[float] = VEHICLE_SCALE,
     ):
         super().__init__()
+        if keys not in ("attended", "embedded"):
+            raise ValueError(f"keys must be 'attended' or 'embedded', got {keys!r}.")
+        self.keys = keys
         self.tokens = _SceneTokens(width, ego_scale, vehicle_scale)
-        self.self_attention = _SelfAttention(width, heads, scale)
+        # With one row to compute, self-attention is ego-attention.
+        first = _SelfAttention if keys == "attended" else _EgoAttention
+        self.self_attention = first(width, heads, scale)
         self.ego_attention = _EgoAttention(width, heads, scale)
         self.layers = nn.ModuleList(_Linear(width, width) for _ in range(depth))
 
     def forward(self, ego: Tensor, vehicles: Tensor) -> Tensor:
         tokens, present = self.tokens(ego, vehicles)
-        tokens = tokens + self.self_attention(tokens, present)
-        row = tokens[..., 0, :]
+        if self.keys == "attended":
+            tokens = tokens + self.self_attention(tokens, present)
+            row = tokens[..., 0, :]
+        else:
+            row = tokens[..., 0, :]
+            row = row + self.self_attention(row, tokens, present)
         row = row + self.ego_attention(row, tokens, present)
         for layer in self.layers:
             row = F.gelu(layer(row))
@@ -194,16 +209,18 @@ class MMAMValue(nn.Module):
     """Action value from ego-attention and an MLP branch (paper, Fig. f5 and AttnE2).
 
     Q(s, a) = Y_attn . W_attn + Y_mlp . W_mlp over the N + 2 tokens of Z_2 (EV, SVs, action). Y_attn
-    is one hop of multi-head ego-attention. Y_mlp is permutation-invariant (ours): a layer of
-    ``pair_width`` units sees each SV together with the EV and the action, its mean over the SVs
-    that are present joins the tokens of EV and action in the first of ``depth`` layers of ``width``
-    units. All activations are GELU.
+    is one hop of multi-head ego-attention. Y_mlp is permutation-invariant (ours): the tokens of EV
+    and action and a mean over the SVs that are present go through ``depth`` layers of ``width``
+    units. With ``branch="vehicle"`` it is the mean of a layer of ``pair_width`` units that sees each
+    SV together with the EV and the action; with ``branch="scene"`` the mean of the SVs' tokens,
+    which no action changes. All activations are GELU.
 
     Args:
         width: d, the size of a token and of both branches.
         heads: h, a divisor of ``width``.
         scale: ``"paper"`` or ``"per_head"``, see :class:`MMAMPolicyEncoder`.
         action_dim: size of the action.
+        branch: what the MLP branch makes of the SVs, ``"vehicle"`` or ``"scene"`` (see above).
         depth: layers of ``width`` units in the MLP branch, at least one (ours).
         pair_width: units of the layer applied to each SV (ours); ``None`` is ``width // 4``.
         ego_scale: divisors of the ego features.
@@ -213,7 +230,7 @@ class MMAMValue(nn.Module):
     returns values [*B, 1].
 
     Raises:
-        ValueError: as :class:`MMAMPolicyEncoder`.
+        ValueError: as :class:`MMAMPolicyEncoder`, or if ``branch`` is unknown.
 
     Examples:
         >>> import torch
@@ -222,8 +239,8 @@ class MMAMValue(nn.Module):
         >>> ego, vehicles, action = torch.randn(5, 9), torch.zeros(5, 11, 6), torch.zeros(5, 2)
         >>> value(ego, vehicles, action).shape
         torch.Size([5, 1])
-        >>> of_action = value.condition(ego, vehicles)  # the scene's part is computed once
-        >>> torch.allclose(of_action(action), value(ego, vehicles, action))
+        >>> scene = value.encode(ego, vehicles)  # once for any number of actions
+        >>> torch.allclose(value.value(scene, action), value(ego, vehicles, action))
         True
     """
 
@@ -233,6 +250,7 @@ class MMAMValue(nn.Module):
         heads: int = 4,
         scale: str = "paper",
         action_dim: int = 2,
+        branch: str = "vehicle",
         depth: int = 2,
         pair_width: int | None = None,
         ego_scale: Sequence[float] = EGO_SCALE,
@@ -241,57 +259,65 @@ class MMAMValue(nn.Module):
         super().__init__()
         if depth < 1:
             raise ValueError(f"depth must be >= 1, got {depth}.")
-        pair_width = width // 4 if pair_width is None else pair_width
+        if branch not in ("vehicle", "scene"):
+            raise ValueError(f"branch must be 'vehicle' or 'scene', got {branch!r}.")
+        pooled = width // 4 if pair_width is None else pair_width
+        if branch == "scene":
+            pooled = width
         self.tokens = _SceneTokens(width, ego_scale, vehicle_scale)
         self.action = _Linear(action_dim, width)
         self.attention = _EgoAttention(width, heads, scale)
-        self.pair = _Linear(3 * width, pair_width)  # on (SV, EV, action)
-        self.joint = _Linear(2 * width + pair_width, width)  # on (EV, action, pooled pairs)
+        # On (SV, EV, action), and on (EV, action, pooled).
+        self.pair = _Linear(3 * width, pooled) if branch == "vehicle" else None
+        self.joint = _Linear(2 * width + pooled, width)
         self.layers = nn.ModuleList(_Linear(width, width) for _ in range(depth - 1))
         self.w_attn = _Linear(width, 1, bias=False)
         self.w_mlp = _Linear(width, 1, bias=False)
 
-    def condition(self, ego: Tensor, vehicles: Tensor) -> Callable[[Tensor], Tensor]:
-        """The value as a function of the action alone, [*B, A] -> [*B, 1], in this scene.
-
-        The function holds the tensors that the module has now, not the module, so it stays valid
-        when a functional call puts the module's own parameters back.
-        """
+    def encode(self, ego: Tensor, vehicles: Tensor) -> dict[str, Tensor]:
+        """What :meth:`value` needs to know of the scene: everything that no action changes."""
         tokens, present = self.tokens(ego, vehicles)
         ego_token, vehicle_tokens = tokens[..., 0, :], tokens[..., 1:, :]
         query = self.attention.folded_query(ego_token)
         readout = self.attention.folded_value(self.w_attn.weight.squeeze(0))
         logits = (query @ tokens.mT).masked_fill(~present.unsqueeze(-2), _MASKED)
-        readings = _linear(tokens, readout).mT
-
-        # A layer on concatenated tokens is a sum of one product for each of them.
-        width = ego_token.shape[-1]
-        on_vehicle, on_ego, pair_on_action = self.pair.weight.split(width, dim=-1)
-        pair_scene = _linear(vehicle_tokens, on_vehicle, self.pair.bias)
-        pair_scene = pair_scene + _linear(ego_token, on_ego).unsqueeze(-2)
-        on_ego, joint_on_action, joint_on_pairs = self.joint.weight.split(
-            [width, width, self.pair.out_features], dim=-1
-        )
-        joint_scene = _linear(ego_token, on_ego, self.joint.bias)
         share = present[..., 1:, None].to(tokens.dtype)
         share = share / share.sum(-2, keepdim=True).clamp(min=1.0)
-        layers = [(layer.weight, layer.bias) for layer in self.layers]
-        action_weight, action_bias, w_mlp = self.action.weight, self.action.bias, self.w_mlp.weight
+        scene = {"query": query, "readout": readout, "logits": logits}
+        scene["readings"] = _linear(tokens, readout).mT
+        # A layer on concatenated tokens is a sum of one product for each of them.
+        width = ego_token.shape[-1]
+        joint_on_ego, _, joint_on_pooled = self._joint_parts()
+        joint = _linear(ego_token, joint_on_ego, self.joint.bias)
+        if self.pair is None:
+            scene["joint"] = joint + _linear((vehicle_tokens * share).sum(-2), joint_on_pooled)
+            return scene
+        on_vehicle, on_ego, _ = self.pair.weight.split(width, dim=-1)
+        pair = _linear(vehicle_tokens, on_vehicle, self.pair.bias)
+        pair = pair + _linear(ego_token, on_ego).unsqueeze(-2)
+        return {**scene, "joint": joint, "pair": pair, "share": share}
 
-        def value(action: Tensor) -> Tensor:
-            token = F.gelu(_linear(action, action_weight, action_bias))
-            logit = (query @ token.unsqueeze(-1)).squeeze(-1)
-            weights = torch.cat([logits, logit.unsqueeze(-1)], dim=-1).softmax(-1)
-            y_attn = (weights[..., :-1] * readings).sum((-2, -1))
-            y_attn = y_attn + (weights[..., -1] * _linear(token, readout)).sum(-1)
-            pairs = F.gelu(pair_scene + _linear(token, pair_on_action).unsqueeze(-2))
-            pooled = (pairs * share).sum(-2)
-            y_mlp = joint_scene + _linear(token, joint_on_action) + _linear(pooled, joint_on_pairs)
-            for weight, bias in layers:
-                y_mlp = _linear(F.gelu(y_mlp), weight, bias)  # pyright: ignore[reportArgumentType]
-            return y_attn.unsqueeze(-1) + _linear(F.gelu(y_mlp), w_mlp)
+    def value(self, scene: dict[str, Tensor], action: Tensor) -> Tensor:
+        """The value of ``action`` [*B, A] in the states of ``scene``, [*B, 1]."""
+        token = F.gelu(self.action(action))
+        logit = (scene["query"] @ token.unsqueeze(-1)).squeeze(-1)
+        weights = torch.cat([scene["logits"], logit.unsqueeze(-1)], dim=-1).softmax(-1)
+        y_attn = (weights[..., :-1] * scene["readings"]).sum((-2, -1))
+        y_attn = y_attn + (weights[..., -1] * _linear(token, scene["readout"])).sum(-1)
+        _, joint_on_action, joint_on_pooled = self._joint_parts()
+        y_mlp = scene["joint"] + _linear(token, joint_on_action)
+        if self.pair is not None:
+            on_action = self.pair.weight[:, -token.shape[-1] :]
+            pairs = F.gelu(scene["pair"] + _linear(token, on_action).unsqueeze(-2))
+            y_mlp = y_mlp + _linear((pairs * scene["share"]).sum(-2), joint_on_pooled)
+        for layer in self.layers:
+            y_mlp = layer(F.gelu(y_mlp))
+        return y_attn.unsqueeze(-1) + self.w_mlp(F.gelu(y_mlp))
 
-        return value
+    def _joint_parts(self) -> tuple[Tensor, ...]:
+        """The joint layer's weights on EV, action and pooled vehicles."""
+        width = self.action.out_features
+        return self.joint.weight.tensor_split([width, 2 * width], dim=-1)
 
     def forward(self, ego: Tensor, vehicles: Tensor, action: Tensor) -> Tensor:
-        return self.condition(ego, vehicles)(action)
+        return self.value(self.encode(ego, vehicles), action)

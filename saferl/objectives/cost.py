@@ -12,9 +12,9 @@ from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.objectives import LossModule, ValueEstimators
-from torchrl.objectives.utils import _cache_values, _vmap_func, distance_loss
+from torchrl.objectives.utils import distance_loss
 
-from saferl.modules import CriticEnsemble, LagrangeMultiplier
+from saferl.modules import BoundCritics, CriticEnsemble, LagrangeMultiplier
 from saferl.modules.critics import REDUCTIONS
 
 #: What the cost critics' target may be of its members' values.
@@ -55,7 +55,6 @@ class CostCriticLoss(LossModule):
     deactivate_vmap: bool
     _value_estimator: Any
     _cost_value_estimator: Any
-    _vmap_cost_criticN0: Any
 
     def _add_cost_critic(
         self,
@@ -87,21 +86,8 @@ class CostCriticLoss(LossModule):
         self.lagrange = lagrange
         device = next(self.parameters()).device
         self.register_buffer("cost_limit", torch.tensor(float(cost_limit), device=device))
-        # The other base chose these before it could see the cost critic.
-        self._vmap_randomness = None
-        self._make_vmap()
         # Made here, not at the first call: a fresh loss then loads a state_dict strictly.
         self._default_value_estimator()
-
-    def _make_vmap(self) -> None:
-        super()._make_vmap()
-        if "cost_critic" in self.__dict__:
-            self._vmap_cost_criticN0 = _vmap_func(
-                self.cost_critic,
-                (None, 0),
-                randomness=self.vmap_randomness,
-                pseudo_vmap=self.deactivate_vmap,
-            )
 
     def make_value_estimator(
         self,
@@ -174,15 +160,18 @@ class CostCriticLoss(LossModule):
             action_key=self.tensor_keys.action,
         )
 
-    @property
-    @_cache_values
-    def _cached_detached_cost_critic_params(self) -> TensorDictBase:
-        return self.cost_critic_params.detach()
+    def _bind(
+        self, critic: TensorDictModule, params: TensorDictBase, tensordict: TensorDictBase
+    ) -> BoundCritics:
+        """All members of a critic in the batch's states."""
+        key, vmap = self.tensor_keys.action, not self.deactivate_vmap
+        return BoundCritics.of(critic, params, tensordict, action_key=key, vmap=vmap)
 
     def cost_loss(
         self,
         tensordict: TensorDictBase,
         next_sample: tuple[TensorDictBase, Tensor] | None = None,
+        critics: BoundCritics | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """E13: cost critics against the target value, with no entropy.
 
@@ -190,6 +179,8 @@ class CostCriticLoss(LossModule):
             tensordict (TensorDictBase): the batch.
             next_sample (optional): next state with the policy's action, and its
                 log-probability ``[*B]``. Drawn afresh by default.
+            critics (optional): the cost critics bound to the batch's states, where
+                they are known already.
 
         Raises:
             KeyError: the batch holds no cost.
@@ -202,18 +193,17 @@ class CostCriticLoss(LossModule):
             )
         next_state, _ = next_sample or self._sample_next(tensordict)
         with torch.no_grad():
-            next_value = self._cost_values(next_state, self.target_cost_critic_params)
+            target_critics = self._bind(
+                self.cost_critic, self.target_cost_critic_params, next_state
+            )
+            next_value = target_critics.values(next_state.get(self.tensor_keys.action))
             next_value = REDUCTIONS[self.cost_target](next_value)
             target = self._cost_value_estimator.value_estimate(
                 tensordict.copy(), next_value=next_value
             )
-        predicted = self._cost_values(tensordict, self.cost_critic_params)
+        critics = critics or self._bind(self.cost_critic, self.cost_critic_params, tensordict)
+        predicted = critics.values(tensordict.get(self.tensor_keys.action))
         return self._bellman_loss(predicted, target, tensordict)
-
-    def _cost_values(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
-        """Value of each member, ``[n, *B, 1]``."""
-        inputs = tensordict.select(*self.cost_critic.in_keys)
-        return self._vmap_cost_criticN0(inputs, params)[self.tensor_keys.state_action_cost_value]
 
     def _bellman_loss(
         self, predicted: Tensor, target: Tensor, tensordict: TensorDictBase

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,7 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import SACLoss
 from torchrl.objectives.sac import compute_rsample_log_prob
 
-from saferl.modules import LagrangeMultiplier
+from saferl.modules import BoundCritics, LagrangeMultiplier
 from saferl.objectives.cost import CostCriticLoss
 
 _LOSSES = ("loss_actor", "loss_qvalue", "loss_cost", "loss_alpha")
@@ -140,7 +139,6 @@ class SACLagLoss(CostCriticLoss, SACLoss):
     default_keys = _AcceptedKeys
 
     log_alpha: Tensor
-    _vmap_qnetworkN0: Callable[..., TensorDictBase]
 
     def __init__(
         self,
@@ -203,9 +201,12 @@ class SACLagLoss(CostCriticLoss, SACLoss):
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         next_sample = self._sample_next(tensordict)
-        loss_qvalue, metadata = self.qvalue_v2_loss(tensordict, next_sample)
-        loss_cost, _ = self.cost_loss(tensordict, next_sample)
-        loss_actor, actor_metadata = self.actor_loss(tensordict)
+        # One look at the states serves the values of the stored action and of the policy's.
+        reward = self._bind(self.qvalue_network, self.qvalue_network_params, tensordict)
+        cost = self._bind(self.cost_critic, self.cost_critic_params, tensordict)
+        loss_qvalue, metadata = self.qvalue_v2_loss(tensordict, next_sample, reward)
+        loss_cost, _ = self.cost_loss(tensordict, next_sample, cost)
+        loss_actor, actor_metadata = self.actor_loss(tensordict, reward, cost)
         log_prob = actor_metadata["log_prob"]
         loss_alpha = self._reduce_loss(
             self._alpha_loss(log_prob),
@@ -244,12 +245,28 @@ class SACLagLoss(CostCriticLoss, SACLoss):
         )
         return td_out
 
-    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """E11: entropy, smallest reward value and penalised largest cost value."""
+    def actor_loss(
+        self,
+        tensordict: TensorDictBase,
+        reward_critics: BoundCritics | None = None,
+        cost_critics: BoundCritics | None = None,
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """E11: entropy, smallest reward value and penalised largest cost value.
+
+        Args:
+            tensordict (TensorDictBase): the batch.
+            reward_critics, cost_critics (optional): the critics bound to the batch's
+                states, where they are known already; their parameters get no gradient.
+        """
+        reward = reward_critics or self._bind(
+            self.qvalue_network, self.qvalue_network_params, tensordict
+        )
+        cost = cost_critics or self._bind(self.cost_critic, self.cost_critic_params, tensordict)
         weights = self._maybe_get_priority_weight(tensordict)
         sample, log_prob = self._sample_action(tensordict)
-        qvalue = self._qvalues(sample, self._cached_detached_qvalue_params).min(0)[0]
-        cost_value = self._cost_values(sample, self._cached_detached_cost_critic_params).max(0)[0]
+        action = sample.get(self.tensor_keys.action)
+        qvalue = reward.detach().values(action).min(0)[0]
+        cost_value = cost.detach().values(action).max(0)[0]
         penalty = self.lagrange.penalty(cost_value.squeeze(-1) - self.cost_limit)
         multiplier = self.lagrange.value.detach().to(penalty)
         loss_actor = self._alpha * log_prob - qvalue.squeeze(-1) + multiplier * penalty
@@ -270,6 +287,7 @@ class SACLagLoss(CostCriticLoss, SACLoss):
         self,
         tensordict: TensorDictBase,
         next_sample: tuple[TensorDictBase, Tensor] | None = None,
+        critics: BoundCritics | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """E12: reward critics against the smallest soft target value.
 
@@ -277,23 +295,23 @@ class SACLagLoss(CostCriticLoss, SACLoss):
             tensordict (TensorDictBase): the batch.
             next_sample (optional): next state with the policy's action, and its
                 log-probability ``[*B]``. Drawn afresh by default.
+            critics (optional): the reward critics bound to the batch's states, where
+                they are known already.
         """
         next_state, log_prob = next_sample or self._sample_next(tensordict)
         with torch.no_grad():
-            next_value = self._qvalues(next_state, self.target_qvalue_network_params).min(0)[0]
+            targets = self._bind(self.qvalue_network, self.target_qvalue_network_params, next_state)
+            next_value = targets.values(next_state.get(self.tensor_keys.action)).min(0)[0]
             next_value = next_value - self._alpha * log_prob.unsqueeze(-1)
             target = self.value_estimator.value_estimate(tensordict.copy(), next_value=next_value)
-        predicted = self._qvalues(tensordict, self.qvalue_network_params)
+        critics = critics or self._bind(self.qvalue_network, self.qvalue_network_params, tensordict)
+        predicted = critics.values(tensordict.get(self.tensor_keys.action))
         return self._bellman_loss(predicted, target, tensordict)
 
     def _alpha_loss(self, log_prob: Tensor) -> Tensor:
         """E14, unreduced ``[*B]``; the parent class weighs with ``log_alpha`` instead."""
         target = self.target_entropy  # a tensor, since the constructor asked for it
         return -self.log_alpha.exp() * (log_prob + target)  # pyright: ignore[reportOperatorIssue]
-
-    def _qvalues(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
-        inputs = tensordict.select(*self.qvalue_network.in_keys)
-        return self._vmap_qnetworkN0(inputs, params)[self.tensor_keys.state_action_value]
 
     def _sample_action(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
         """Copy of ``tensordict`` with an action of the policy, and its log-probability."""

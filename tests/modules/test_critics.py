@@ -32,7 +32,7 @@ def critics(kind="mmam", n=2):
 
 
 def plain_critics():
-    """Critics without `condition`, whose action is not the last input."""
+    """Critics that are not split, whose action is not the last input."""
     torch.manual_seed(0)
     nets = [nn.Bilinear(2, 9, 1) for _ in range(2)]
     return [TensorDictModule(net, ["action", "ego"], [KEY]) for net in nets]
@@ -140,12 +140,12 @@ def test_view_follows_a_loss():
 
 
 def test_binding_leaves_no_trace():
-    """No gradient on a parameter, and the template keeps its own weights."""
+    """Detached: no gradient on a parameter. The template keeps its own weights."""
     loss, members = make_loss()
     view, td = view_of(loss), scene()
     own = members[0].module.w_attn.weight
     action = td["action"].clone().requires_grad_()
-    view.bind(td)(action).sum().backward()
+    view.bind(td).detach()(action).sum().backward()
     assert action.grad.abs().sum() > 0
     assert all(p.grad is None for p in loss.parameters())
     assert members[0].module.w_attn.weight is own

@@ -9,10 +9,26 @@ import torch
 import torch.nn.functional as F
 from tensordict import TensorDict
 
-from saferl.modules import EGO_SCALE, VEHICLE_SCALE, MMAMPolicyEncoder, MMAMValue
+from saferl.modules import (
+    EGO_SCALE,
+    VEHICLE_SCALE,
+    MMAMPolicyEncoder,
+    MMAMValue,
+    PlainMMAMPolicyEncoder,
+    PlainMMAMValue,
+)
 
 WIDTH, HEADS = 16, 4
 SCALES = ["paper", "per_head"]
+FORMS = [
+    (kind, {name: value})
+    for name, values, kinds in (
+        ("keys", ("attended", "embedded"), (MMAMPolicyEncoder, PlainMMAMPolicyEncoder)),
+        ("branch", ("vehicle", "scene"), (MMAMValue, PlainMMAMValue)),
+    )
+    for value in values
+    for kind in kinds
+]
 
 
 def scene(batch=(5,), present=3, absent=2, dtype=torch.float32, seed=0):
@@ -52,14 +68,21 @@ def embed(net, ego, vehicles):
     return z_ego.unsqueeze(0), z_sv
 
 
+def weights_of(hop):
+    return (m.weight for m in (hop.query, hop.key, hop.value, hop.merge))
+
+
 def plain_policy(net, ego, vehicles, scale):
     z_1 = torch.cat(embed(net, ego, vehicles))
-    w_q, w_k, w_v = net.self_attention.query_key_value.weight.chunk(3)
-    hop = net.self_attention.merge.weight
-    z_1 = z_1 + multi_head(z_1, z_1, w_q, w_k, w_v, hop, scale)
-    ego_hop = net.ego_attention
-    weights = (m.weight for m in (ego_hop.query, ego_hop.key, ego_hop.value, ego_hop.merge))
-    row = (z_1[:1] + multi_head(z_1[:1], z_1, *weights, scale)).squeeze(0)
+    hop = net.self_attention
+    if net.keys == "attended":
+        weights = (*hop.query_key_value.weight.chunk(3), hop.merge.weight)
+    else:
+        weights = weights_of(hop)
+    attended = z_1 + multi_head(z_1, z_1, *weights, scale)
+    memory = attended if net.keys == "attended" else z_1
+    row = attended[:1] + multi_head(attended[:1], memory, *weights_of(net.ego_attention), scale)
+    row = row.squeeze(0)
     for layer in net.layers:
         row = F.gelu(layer(row))
     return row
@@ -69,12 +92,12 @@ def plain_value(net, ego, vehicles, action, scale):
     z_ego, z_sv = embed(net, ego, vehicles)
     z_action = F.gelu(net.action(action)).unsqueeze(0)
     z_2 = torch.cat([z_ego, z_sv, z_action])
-    hop = net.attention
-    weights = (m.weight for m in (hop.query, hop.key, hop.value, hop.merge))
-    y_attn = multi_head(z_ego, z_2, *weights, scale)
-    pooled = torch.zeros(1, net.pair.out_features, dtype=ego.dtype)
+    y_attn = multi_head(z_ego, z_2, *weights_of(net.attention), scale)
+    pooled = torch.zeros(1, net.joint.in_features - 2 * WIDTH, dtype=ego.dtype)
     for row in z_sv:
-        pooled = pooled + F.gelu(net.pair(torch.cat([row, z_ego[0], z_action[0]]))) / len(z_sv)
+        if net.pair is not None:
+            row = F.gelu(net.pair(torch.cat([row, z_ego[0], z_action[0]])))
+        pooled = pooled + row / len(z_sv)
     y_mlp = F.gelu(net.joint(torch.cat([z_ego, z_action, pooled], dim=-1)))
     for layer in net.layers:
         y_mlp = F.gelu(layer(y_mlp))
@@ -82,15 +105,14 @@ def plain_value(net, ego, vehicles, action, scale):
 
 
 @pytest.mark.parametrize("scale", SCALES)
-@pytest.mark.parametrize(
-    ("kind", "plain"), [(MMAMPolicyEncoder, plain_policy), (MMAMValue, plain_value)]
-)
+@pytest.mark.parametrize(("kind", "options"), FORMS)
 @pytest.mark.parametrize("present", [0, 1, 3])
-def test_equals_plain_formulation(kind, plain, scale, present):
+def test_equals_printed_formulas(kind, options, scale, present):
     """Values and all gradients, in float64, to 1e-10."""
-    net = make(kind, torch.float64, scale=scale)
+    net = make(kind, torch.float64, scale=scale, **options)
+    plain = plain_value if isinstance(net, MMAMValue) else plain_policy
     inputs = scene(present=present, dtype=torch.float64)
-    inputs = [x.requires_grad_() for x in inputs[: 2 if kind is MMAMPolicyEncoder else 3]]
+    inputs = [x.requires_grad_() for x in inputs[: 3 if isinstance(net, MMAMValue) else 2]]
     leaves = [*net.parameters(), *inputs]
 
     ours = net(*inputs)
@@ -196,16 +218,6 @@ def test_functional_transforms(kind):
     torch.testing.assert_close(compiled(*inputs), each[0])
 
 
-def test_condition_outlives_a_functional_call():
-    """The function of the action keeps the parameters of the call that made it."""
-    torch.manual_seed(0)
-    nets = [MMAMValue(width=WIDTH, heads=HEADS) for _ in range(2)]
-    ego, vehicles, action = scene()
-    with TensorDict.from_module(nets[1]).to_module(nets[0], preserve_module_state=False):
-        of_action = nets[0].condition(ego, vehicles)
-    torch.testing.assert_close(of_action(action), nets[1](ego, vehicles, action))
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -219,3 +231,10 @@ def test_condition_outlives_a_functional_call():
 def test_errors(kind, options, message):
     with pytest.raises(ValueError, match=message):
         kind(**{"width": 16, **options})
+
+
+def test_unknown_forms_are_refused():
+    with pytest.raises(ValueError, match="keys must be 'attended' or 'embedded', got 'both'"):
+        MMAMPolicyEncoder(16, keys="both")
+    with pytest.raises(ValueError, match="branch must be 'vehicle' or 'scene', got 'token'"):
+        MMAMValue(16, branch="token")

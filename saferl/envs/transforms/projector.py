@@ -35,9 +35,9 @@ class SafetyProjector(Transform):
 
     Args:
         risk: a TensorDictModule that reads observation entries and the action and writes the risk
-            [*B, 1] under its first ``out_key``. If it has a ``bind(tensordict)`` method (as
-            :class:`saferl.modules.CriticEnsemble` does), that is used to compute what does not
-            depend on the action once for all steps.
+            [*B, 1] under its first ``out_key``. If it has a ``bind(tensordict)`` method that returns
+            :class:`saferl.modules.BoundCritics` (as :class:`saferl.modules.CriticEnsemble` does), what
+            does not depend on the action is computed once for all steps.
         limit: d_thres, the largest risk that is left alone.
         steps: N_iter, the largest number of correction steps.
         step_size: eta, the largest move of a coordinate in a step.
@@ -118,7 +118,7 @@ class SafetyProjector(Transform):
         """The risk [N, 1] as a function of the action alone [N, A]."""
         bind = getattr(self.risk, "bind", None)
         if bind is not None:
-            return bind(tensordict)
+            return bind(tensordict).detach()
         inputs = tensordict.select(*self.risk.in_keys)
         key = self.risk.out_keys[0]
         return lambda action: self.risk(inputs.copy().set(self.action_key, action)).get(key)
