@@ -1,7 +1,7 @@
 """One gradient update of SAC-Lagrangian (E11 to E14) written straight in PyTorch, as CleanRL would.
 
-The baseline that ``benchmarks/update.py`` times :class:`saferl.objectives.SACLagLoss` against: plain
-modules, one optimizer for each kind of parameter, and every loss spelled out.
+The baseline that ``benchmarks/update.py`` times :class:`saferl.objectives.SACLagLoss` against:
+plain modules, one optimizer for each kind of parameter, and every loss spelled out.
 """
 
 from __future__ import annotations
@@ -77,7 +77,8 @@ class StraightSACLag:
         gamma: discount of reward and cost.
         tau: step of the soft target update.
         cost_limit: d, the bound on the cost critics' value.
-        compile: compile the losses of the critics and of the actor.
+        compile: compile the losses of the critics and of the actor, which is faster than to compile
+            ``update``: that breaks at every ``zero_grad``, ``backward`` and fused ``step``.
     """
 
     def __init__(

@@ -1,0 +1,186 @@
+"""Gradient updates per second, beside the forms that one would write first.
+
+    python benchmarks/update.py [--omnisafe PYTHON] [--width 256] [--batch 256] [--rounds 5]
+        [--seconds 3] [--clock wall] [--threads 1] [--device cpu] [--json PATH]
+
+An update is whole on every side: losses, gradients, optimizer and target networks, on one and the same
+batch. The sides take turns in one process:
+
+- ARSAC with MMAM as printed (``PlainMMAMPolicyEncoder``, ``PlainMMAMValue``), with ours, and with ours
+  compiled;
+- SAC-Lag on MLPs, ours and a straight PyTorch implementation (``benchmarks/straight.py``), each eager
+  and compiled;
+- SAC on the same MLPs by TorchRL's own loss, for scale: it has no cost critics;
+- OmniSafe's SACLag, where ``--omnisafe`` names the Python of an environment that has it
+  (``benchmarks/omnisafe_sac_lag.py`` says how to make one). It has one cost critic where ours has two.
+
+GFLOP are those of one eager update as torch counts them; the share is of the rate of a product of two
+1,024 x 1,024 matrices, measured in the same rounds.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from hydra import compose, initialize_config_dir
+from side_by_side import alternate, conditions, medians, parser, write
+from straight import StraightSACLag
+from tensordict import TensorDict
+from torch.utils.flop_counter import FlopCounterMode
+from torchrl.objectives import SoftUpdate
+
+from saferl.builders import build_agent, build_optimizer
+from saferl.learner import Learner
+from saferl.paths import config_dir
+
+ROWS = 11
+PLAIN = [
+    "encoder.policy._target_=saferl.modules.PlainMMAMPolicyEncoder",
+    "encoder.value._target_=saferl.modules.PlainMMAMValue",
+]
+
+
+def transitions(batch: int, device: str) -> TensorDict:
+    """Random ones with 0 to 10 vehicles in sight, in SI units."""
+    generator = torch.Generator().manual_seed(0)
+
+    def scene() -> dict[str, torch.Tensor]:
+        ego = torch.randn(batch, 9, generator=generator) * 5
+        vehicles = torch.randn(batch, ROWS, 6, generator=generator) * 10
+        count = torch.randint(0, ROWS, (batch, 1), generator=generator)
+        vehicles[..., 0] = (torch.arange(ROWS) < count).float()
+        return {"ego": ego, "vehicles": vehicles * vehicles[..., :1]}
+
+    action = torch.rand(batch, 2, generator=generator) * 2 - 1
+    ended = torch.rand(batch, 1, generator=generator) < 0.02
+    following = {
+        **scene(),
+        "reward": torch.randn(batch, 1, generator=generator),
+        "cost": torch.rand(batch, 1, generator=generator) * 0.1,
+        "done": ended,
+        "terminated": ended,
+    }
+    return TensorDict({**scene(), "action": action, "next": following}, [batch]).to(device)
+
+
+def learner(overrides: list[str], device: str, compile: bool) -> Learner:
+    with initialize_config_dir(config_dir(), version_base=None):
+        cfg = compose("config", [*overrides, f"device={device}"])
+    torch.manual_seed(0)
+    loss = build_agent(cfg).loss
+    optimizer = build_optimizer(cfg, loss)
+    return Learner(loss, optimizer, SoftUpdate(loss, tau=cfg.tau), compile=compile)
+
+
+def main() -> None:
+    args = parser(__doc__)
+    args.add_argument("--width", type=int, default=256)
+    args.add_argument("--batch", type=int, default=256)
+    args.add_argument("--omnisafe", type=Path, metavar="PYTHON")
+    options = args.parse_args()
+    torch.set_num_threads(options.threads)
+
+    data, width, device = transitions(options.batch, options.device), options.width, options.device
+    nested = {f"next_{k}": data["next", k] for k in ("ego", "vehicles")}
+    flat = {k: data["next", k] for k in ("reward", "cost", "terminated")}
+    flat |= {k: data[k] for k in ("ego", "vehicles", "action")} | nested
+
+    sides: dict[str, Callable[[], int]] = {}
+    flops: dict[str, float] = {}
+
+    def add(name: str, update: Callable, batch, same_as: str | None = None) -> None:
+        """A side, warmed up; compiled ones have the arithmetic of the eager one."""
+
+        def work() -> int:
+            update(batch)
+            return 1
+
+        if same_as is None:
+            with FlopCounterMode(display=False) as counter:
+                work()
+            flops[name] = counter.get_total_flops() / 1e9
+        else:
+            flops[name] = flops[same_as]
+        for _ in range(3):
+            work()
+        sides[name] = work
+
+    def ours(name: str, overrides: list[str], both: bool = True) -> None:
+        overrides = [*overrides, f"encoder.policy.width={width}"]
+        add(f"{name} eager", learner(overrides, device, False).update, data)
+        if both:
+            compiled = learner(overrides, device, True).update
+            add(f"{name} compiled", compiled, data, f"{name} eager")
+
+    ours("arsac plain", ["algo=arsac", *PLAIN], both=False)
+    ours("arsac", ["algo=arsac"])
+    ours("sac_lag", ["algo=sac_lag"])
+    for compile in (False, True):
+        straight = StraightSACLag(width=width, rows=ROWS, compile=compile)
+        name = f"straight sac_lag {'compiled' if compile else 'eager'}"
+        add(name, straight.update, flat, "straight sac_lag eager" if compile else None)
+    ours("torchrl sac", ["algo=sac"])
+
+    square = torch.randn(1024, 1024, device=device)
+
+    def product() -> int:
+        torch.mm(square, square)
+        return 1
+
+    sides["gemm"], flops["gemm"] = product, 2 * 1024**3 / 1e9
+    rates = alternate(sides, options)
+    if options.omnisafe:
+        command = [options.omnisafe, Path(__file__).with_name("omnisafe_sac_lag.py"), "--same-work"]
+        answer = subprocess.run(
+            [*map(str, command), "--seconds", str(options.seconds)],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        key = {"wall": "updates_per_second", "cpu": "updates_per_cpu_second"}[options.clock]
+        rates["omnisafe sac_lag"] = [json.loads(answer.stdout.strip().splitlines()[-1])[key]]
+
+    speed = medians(rates)
+    peak = speed["gemm"] * flops["gemm"]
+    print(f"{conditions(options)}, batch {options.batch}, width {width}")
+    print(f"GEMM rate {peak:.0f} GFLOP/s")
+    print(f"{'':28s}{'updates/s':>10s}{'GFLOP':>8s}{'of GEMM':>9s}")
+    for name in speed:
+        if name != "gemm":
+            work = (
+                f"{flops[name]:8.2f}{speed[name] * flops[name] / peak:9.0%}"
+                if name in flops
+                else ""
+            )
+            print(f"{name:28s}{speed[name]:10.1f}{work}")
+
+    def ratio(left: str, right: str) -> float:
+        print(f"{left} / {right}: {speed[left] / speed[right]:.2f}")
+        return speed[left] / speed[right]
+
+    figures = {
+        "arsac": {
+            "ratio_eager_over_plain": ratio("arsac eager", "arsac plain eager"),
+            "ratio_over_plain": ratio("arsac compiled", "arsac plain eager"),
+        },
+        "sac_lag": {
+            "ratio_eager_over_plain": ratio("sac_lag eager", "straight sac_lag eager"),
+            "ratio_over_plain": ratio("sac_lag compiled", "straight sac_lag compiled"),
+        },
+        "updates_per_second": speed,
+        "gflop": flops,
+        "rounds": rates,
+        "conditions": conditions(options),
+    }
+    if options.omnisafe:
+        over = ratio("sac_lag compiled", "omnisafe sac_lag")
+        figures["sac_lag"]["ratio_over_omnisafe"] = over
+    write(options.json, figures)
+
+
+if __name__ == "__main__":
+    main()
