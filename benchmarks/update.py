@@ -30,7 +30,8 @@ from hydra import compose, initialize_config_dir
 from side_by_side import alternate, conditions, medians, parser, write
 from straight import StraightSACLag
 from tensordict import TensorDict
-from torch.utils.flop_counter import FlopCounterMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.flop_counter import flop_registry
 from torchrl.objectives import SoftUpdate
 
 from saferl.builders import build_agent, build_optimizer
@@ -42,6 +43,18 @@ PLAIN = [
     "encoder.policy._target_=saferl.modules.PlainMMAMPolicyEncoder",
     "encoder.value._target_=saferl.modules.PlainMMAMValue",
 ]
+
+
+class Flops(TorchDispatchMode):
+    """Counts by torch's own table; torch's counter also tracks modules, which TensorDict's refuse."""
+
+    total = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        if (count := flop_registry.get(func._overloadpacket)) is not None:
+            self.total += count(*args, **(kwargs or {}), out_val=out)
+        return out
 
 
 def transitions(batch: int, device: str) -> TensorDict:
@@ -100,9 +113,9 @@ def main() -> None:
             return 1
 
         if same_as is None:
-            with FlopCounterMode(display=False) as counter:
+            with Flops() as counter:
                 work()
-            flops[name] = counter.get_total_flops() / 1e9
+            flops[name] = counter.total / 1e9
         else:
             flops[name] = flops[same_as]
         for _ in range(3):

@@ -105,17 +105,15 @@ def value_operator(
 class BoundCritics:
     """Critics with stacked parameters in given states: values as functions of the action alone.
 
-    A network with ``encode(*scene)`` and ``value(encoded, action)``, as :class:`MMAMValue` and
-    :class:`MLPValue` are, is split: what no action changes is computed once, by :meth:`of`, for any
-    number of actions. Any other critic is evaluated whole for each action.
+    A network with ``encode(*inputs)`` and a function ``value(encoded, action)`` that needs nothing
+    else, as :class:`MMAMValue` and :class:`MLPValue` have, is split: what no action changes is
+    computed once, by :meth:`of`, for any number of actions. Other critics are evaluated whole.
 
     Attributes:
-        template: a critic, whose structure alone is used.
-        params: the parameters and buffers of all members, with batch size [n].
-        scene: the states as the members encode them, or the entries that they read.
+        value: a member's value [*B, 1] from its scene and actions [*B, A].
+        scenes: what each member knows of the states, with the weights that meet the action: a tuple
+            of the members' scenes, or one scene of stacked tensors [n, ...], evaluated at once.
         reduce: ``"max"``, ``"min"`` or ``"mean"``, what a call makes of the members' values.
-        action_key: the entry that the action is for critics that are not split.
-        vmap: whether the members are evaluated at once, or else one by one.
 
     Examples:
         >>> import torch
@@ -129,59 +127,62 @@ class BoundCritics:
         (torch.Size([2, 5, 1]), torch.Size([5, 1]))
     """
 
-    template: TensorDictModuleBase
-    params: TensorDictBase
-    scene: Any
+    value: Callable[[Any, Tensor], Tensor]
+    scenes: Any
     reduce: str = "max"
-    action_key: NestedKey = "action"
-    vmap: bool = True
 
     @classmethod
     def of(
         cls,
-        template: TensorDictModuleBase,
+        critic: TensorDictModuleBase,
         params: TensorDictBase,
         tensordict: TensorDictBase,
-        **options: Any,
+        *,
+        action_key: NestedKey = "action",
+        reduce: str = "max",
+        vmap: bool | None = None,
     ) -> BoundCritics:
-        """Binds critics to the states in ``tensordict``, of which the action is not read."""
-        bound = cls(template, params, None, **options)
-        scene_keys = [key for key in template.in_keys if key != bound.action_key]
-        network = getattr(template, "module", None)
-        if hasattr(network, "encode") and template.in_keys[-1] == bound.action_key:
-            scene = bound._each(bound._encode, (0, None), [tensordict.get(k) for k in scene_keys])
+        """Binds critics to the states in ``tensordict``, of which the action is not read.
+
+        Args:
+            critic: one of them, whose structure alone is used.
+            params: the parameters and buffers of all members, with batch size [n].
+            tensordict: holds what the critics read.
+            action_key: the entry that is the action.
+            reduce: see the class.
+            vmap: whether to stack the members; by default on a GPU, which they fill together. A core
+                of a CPU is full with one.
+        """
+        states = tensordict.select(*(key for key in critic.in_keys if key != action_key))
+        network = getattr(critic, "module", None)
+        split = critic.in_keys[-1] == action_key and getattr(network, "encode", None) is not None
+
+        def encode(params: TensorDictBase, states: TensorDictBase) -> Any:
+            if not split:
+                return [params, states]
+            with params.to_module(critic, preserve_module_state=False):
+                return network.encode(*map(states.get, critic.in_keys[:-1]))  # pyright: ignore
+
+        def whole(scene: Any, action: Tensor) -> Tensor:
+            params, states = scene
+            with params.to_module(critic, preserve_module_state=False):
+                return critic(states.copy().set(action_key, action)).get(critic.out_keys[0])
+
+        if vmap is None:
+            vmap = tensordict.device is not None and tensordict.device.type != "cpu"
+        if vmap:
+            states = states.expand(params.batch_size[0], *states.batch_size)
+            scenes = torch.vmap(encode)(params, states) if split else [params, states]
         else:
-            scene = tensordict.select(*scene_keys)
-        return replace(bound, scene=scene)
-
-    def _each(self, function: Callable, in_dims: tuple, *args: Any) -> Any:
-        """``function(params, *args)`` of each member, stacked."""
-        if self.vmap:
-            return torch.vmap(function, in_dims, randomness="different")(self.params, *args)
-        results = []
-        for i, params in enumerate(self.params.unbind(0)):
-            own = [
-                arg if dim is None else tree_map(lambda x, i=i: x[i], arg)
-                for arg, dim in zip(args, in_dims[1:], strict=True)
-            ]
-            results.append(function(params, *own))
-        return tree_map(lambda *parts: torch.stack(parts), *results)
-
-    def _encode(self, params: TensorDictBase, inputs: list[Tensor]) -> Any:
-        with params.to_module(self.template, preserve_module_state=False):
-            return self.template.module.encode(*inputs)  # pyright: ignore
-
-    def _value(self, params: TensorDictBase, scene: Any, action: Tensor) -> Tensor:
-        with params.to_module(self.template, preserve_module_state=False):
-            if isinstance(scene, TensorDictBase):
-                output = self.template(scene.copy().set(self.action_key, action))
-                return output.get(self.template.out_keys[0])
-            return self.template.module.value(scene, action)  # pyright: ignore
+            scenes = tuple(encode(member, states) for member in params.unbind(0))
+        return cls(network.value if split else whole, scenes, reduce)  # pyright: ignore
 
     def values(self, action: Tensor) -> Tensor:
         """The value of each member, [n, *B, 1], for actions [*B, A]."""
-        whole = isinstance(self.scene, TensorDictBase)
-        return self._each(self._value, (0, None if whole else 0, None), self.scene, action)
+        if isinstance(self.scenes, tuple):
+            return torch.stack([self.value(scene, action) for scene in self.scenes])
+        value = torch.vmap(self.value, (0, None), randomness="different")
+        return value(self.scenes, action)
 
     def __call__(self, action: Tensor) -> Tensor:
         """The members' values reduced to one, [*B, 1]."""
@@ -189,8 +190,7 @@ class BoundCritics:
 
     def detach(self) -> BoundCritics:
         """The same, differentiable with respect to the action alone."""
-        scene = tree_map(Tensor.detach, self.scene)
-        return replace(self, params=self.params.detach(), scene=scene)
+        return replace(self, scenes=tree_map(lambda x: x.detach(), self.scenes))
 
 
 class CriticEnsemble(TensorDictModuleBase):

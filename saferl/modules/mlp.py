@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -130,16 +131,20 @@ class MLPValue(nn.Module):
         sizes = [width] * (depth - 1) + [1]
         self.layers = nn.ModuleList(nn.Linear(width, size) for size in sizes)
 
-    def encode(self, ego: Tensor, vehicles: Tensor) -> dict[str, Tensor]:
-        """What :meth:`value` needs to know of the scene: the first layer's sum over it."""
-        on_scene = self.first.weight[:, : self.scene.size]
-        return {"first": F.linear(self.scene(ego, vehicles), on_scene, self.first.bias)}
+    def encode(self, ego: Tensor, vehicles: Tensor) -> dict[str, Any]:
+        """All that :meth:`value` needs: the first layer's sum over the scene, and the weights."""
+        on_scene, on_action = self.first.weight.tensor_split([self.scene.size], dim=-1)
+        return {
+            "first": F.linear(self.scene(ego, vehicles), on_scene, self.first.bias),
+            "on_action": on_action,
+            "layers": [[layer.weight, layer.bias] for layer in self.layers],
+        }
 
-    def value(self, scene: dict[str, Tensor], action: Tensor) -> Tensor:
+    def value(self, scene: dict[str, Any], action: Tensor) -> Tensor:
         """The value of ``action`` [*B, A] in the states of ``scene``, [*B, 1]."""
-        hidden = scene["first"] + F.linear(action, self.first.weight[:, self.scene.size :])
-        for layer in self.layers:
-            hidden = layer(self.activation(hidden))
+        hidden = scene["first"] + F.linear(action, scene["on_action"])
+        for weight, bias in scene["layers"]:
+            hidden = F.linear(self.activation(hidden), weight, bias)
         return hidden
 
     def forward(self, ego: Tensor, vehicles: Tensor, action: Tensor) -> Tensor:

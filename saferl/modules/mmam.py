@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -274,50 +275,48 @@ class MMAMValue(nn.Module):
         self.w_attn = _Linear(width, 1, bias=False)
         self.w_mlp = _Linear(width, 1, bias=False)
 
-    def encode(self, ego: Tensor, vehicles: Tensor) -> dict[str, Tensor]:
-        """What :meth:`value` needs to know of the scene: everything that no action changes."""
+    def encode(self, ego: Tensor, vehicles: Tensor) -> dict[str, Any]:
+        """All that :meth:`value` needs: what no action changes, and the weights on the action."""
         tokens, present = self.tokens(ego, vehicles)
         ego_token, vehicle_tokens = tokens[..., 0, :], tokens[..., 1:, :]
+        width = ego_token.shape[-1]
         query = self.attention.folded_query(ego_token)
         readout = self.attention.folded_value(self.w_attn.weight.squeeze(0))
         logits = (query @ tokens.mT).masked_fill(~present.unsqueeze(-2), _MASKED)
         share = present[..., 1:, None].to(tokens.dtype)
         share = share / share.sum(-2, keepdim=True).clamp(min=1.0)
-        scene = {"query": query, "readout": readout, "logits": logits}
-        scene["readings"] = _linear(tokens, readout).mT
         # A layer on concatenated tokens is a sum of one product for each of them.
-        width = ego_token.shape[-1]
-        joint_on_ego, _, joint_on_pooled = self._joint_parts()
-        joint = _linear(ego_token, joint_on_ego, self.joint.bias)
+        on_ego, joint_on_action, on_pooled = self.joint.weight.tensor_split([width, 2 * width], -1)
+        joint = _linear(ego_token, on_ego, self.joint.bias)
+        scene = {"query": query, "logits": logits, "readings": _linear(tokens, readout).mT}
         if self.pair is None:
-            scene["joint"] = joint + _linear((vehicle_tokens * share).sum(-2), joint_on_pooled)
-            return scene
-        on_vehicle, on_ego, _ = self.pair.weight.split(width, dim=-1)
-        pair = _linear(vehicle_tokens, on_vehicle, self.pair.bias)
-        pair = pair + _linear(ego_token, on_ego).unsqueeze(-2)
-        return {**scene, "joint": joint, "pair": pair, "share": share}
+            joint = joint + _linear((vehicle_tokens * share).sum(-2), on_pooled)
+        else:
+            on_vehicle, on_ego, pair_on_action = self.pair.weight.split(width, dim=-1)
+            pair = _linear(vehicle_tokens, on_vehicle, self.pair.bias)
+            pair = pair + _linear(ego_token, on_ego).unsqueeze(-2)
+            scene |= {"pair": pair, "share": share}
+            scene |= {"pair_on_action": pair_on_action, "joint_on_pooled": on_pooled}
+        scene |= {"joint": joint, "joint_on_action": joint_on_action, "readout": readout}
+        scene |= {"action": [self.action.weight, self.action.bias], "w_mlp": self.w_mlp.weight}
+        return scene | {"layers": [[layer.weight, layer.bias] for layer in self.layers]}
 
-    def value(self, scene: dict[str, Tensor], action: Tensor) -> Tensor:
+    @staticmethod
+    def value(scene: dict[str, Any], action: Tensor) -> Tensor:
         """The value of ``action`` [*B, A] in the states of ``scene``, [*B, 1]."""
-        token = F.gelu(self.action(action))
+        token = F.gelu(_linear(action, *scene["action"]))
         logit = (scene["query"] @ token.unsqueeze(-1)).squeeze(-1)
         weights = torch.cat([scene["logits"], logit.unsqueeze(-1)], dim=-1).softmax(-1)
         y_attn = (weights[..., :-1] * scene["readings"]).sum((-2, -1))
         y_attn = y_attn + (weights[..., -1] * _linear(token, scene["readout"])).sum(-1)
-        _, joint_on_action, joint_on_pooled = self._joint_parts()
-        y_mlp = scene["joint"] + _linear(token, joint_on_action)
-        if self.pair is not None:
-            on_action = self.pair.weight[:, -token.shape[-1] :]
-            pairs = F.gelu(scene["pair"] + _linear(token, on_action).unsqueeze(-2))
-            y_mlp = y_mlp + _linear((pairs * scene["share"]).sum(-2), joint_on_pooled)
-        for layer in self.layers:
-            y_mlp = layer(F.gelu(y_mlp))
-        return y_attn.unsqueeze(-1) + self.w_mlp(F.gelu(y_mlp))
-
-    def _joint_parts(self) -> tuple[Tensor, ...]:
-        """The joint layer's weights on EV, action and pooled vehicles."""
-        width = self.action.out_features
-        return self.joint.weight.tensor_split([width, 2 * width], dim=-1)
+        y_mlp = scene["joint"] + _linear(token, scene["joint_on_action"])
+        if "pair" in scene:
+            pairs = F.gelu(scene["pair"] + _linear(token, scene["pair_on_action"]).unsqueeze(-2))
+            pooled = (pairs * scene["share"]).sum(-2)
+            y_mlp = y_mlp + _linear(pooled, scene["joint_on_pooled"])
+        for weight, bias in scene["layers"]:
+            y_mlp = _linear(F.gelu(y_mlp), weight, bias)
+        return y_attn.unsqueeze(-1) + _linear(F.gelu(y_mlp), scene["w_mlp"])
 
     def forward(self, ego: Tensor, vehicles: Tensor, action: Tensor) -> Tensor:
         return self.value(self.encode(ego, vehicles), action)

@@ -75,13 +75,10 @@ class PlainMMAMValue(MMAMValue):
         True
     """
 
-    def encode(self, ego: Tensor, vehicles: Tensor) -> dict[str, Tensor]:
-        """The scene as it is: nothing is computed in advance."""
-        return {"ego": ego, "vehicles": vehicles}
+    encode = None  # not split: an ensemble evaluates it whole for each action
 
-    def value(self, scene: dict[str, Tensor], action: Tensor) -> Tensor:
-        """The value of ``action`` [*B, A] in the states of ``scene``, [*B, 1]."""
-        tokens, present = self.tokens(scene["ego"], scene["vehicles"])
+    def forward(self, ego: Tensor, vehicles: Tensor, action: Tensor) -> Tensor:
+        tokens, present = self.tokens(ego, vehicles)
         action_token = F.gelu(self.action(action)).unsqueeze(-2)
         tokens = torch.cat([tokens, action_token], dim=-2)
         y_attn = _ego_attend(

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import functools
+import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+log = logging.getLogger(__name__)
+
+#: Steps between two looks at whether any sample still moves, in compiled code.
+_TOGETHER = 5
 
 
 @dataclass(frozen=True)
@@ -31,21 +39,79 @@ class ProjectionResult:
     feasible: Tensor
 
 
-def _descent_gradient(
-    action: Tensor, start: Tensor, risk: Tensor, penalty: float, low: float, high: float
-) -> Tensor:
-    """Gradient of the soft loss (E9), without components that point out of the box."""
-    slope = None
-    if risk.requires_grad:
-        (slope,) = torch.autograd.grad(
-            risk, action, grad_outputs=torch.ones_like(risk), allow_unused=True
+class _Descent(NamedTuple):
+    """Where each sample stands; all but the actions [*B, A] are [*B]."""
+
+    action: Tensor
+    slope: Tensor  # dQ_c/da there
+    risk: Tensor
+    active: Tensor
+    steps: Tensor
+    safest: Tensor
+    least: Tensor
+
+
+def _evaluate(risk_fn: Callable[[Tensor], Tensor], action: Tensor) -> tuple[Tensor, Tensor]:
+    """Risk [*B] of each action and its gradient [*B, A]."""
+
+    def total(action: Tensor) -> tuple[Tensor, Tensor]:
+        risk = risk_fn(action)
+        if risk.shape == (*action.shape[:-1], 1):
+            risk = risk.squeeze(-1)
+        if risk.shape != action.shape[:-1]:
+            raise ValueError(
+                f"risk_fn must return a risk of shape {tuple(action.shape[:-1])} or "
+                f"{(*action.shape[:-1], 1)} for actions of shape {tuple(action.shape)}, got "
+                f"{tuple(risk.shape)}."
+            )
+        return risk.sum(), risk
+
+    slope, risk = torch.func.grad(total, has_aux=True)(action)
+    return risk, slope
+
+
+def _descend(
+    risk_fn: Callable[[Tensor], Tensor],
+    at: _Descent,
+    start: Tensor,
+    limit: float,
+    steps: int,
+    step_size: float,
+    penalty: float,
+    low: float,
+    high: float,
+) -> _Descent:
+    """Up to ``steps`` steps of the samples that are still active."""
+    for _ in range(steps):
+        # The gradient of the soft loss (E9), without components that point out of the box.
+        gradient = at.action - start + penalty * at.slope
+        outward = ((at.action >= high) & (gradient < 0)) | ((at.action <= low) & (gradient > 0))
+        gradient = torch.where(outward, 0.0, gradient)
+        norm = gradient.abs().amax(-1)
+        # A gradient that is not finite cannot say where to go: the sample stops like at g = 0.
+        active = at.active & (norm > 0) & norm.isfinite()
+        scale = torch.where(active, step_size / norm, 0.0).unsqueeze(-1)
+        moved = (at.action - scale * gradient).clamp(low, high)
+        action = torch.where(active.unsqueeze(-1), moved, at.action)
+        risk, slope = _evaluate(risk_fn, action)
+        better = active & (risk < at.least)
+        at = _Descent(
+            action=action,
+            slope=slope,
+            risk=risk,
+            active=active & (risk > limit),
+            steps=at.steps + active,
+            safest=torch.where(better.unsqueeze(-1), action, at.safest),
+            least=torch.where(better, risk, at.least),
         )
-    gradient = action.detach() - start
-    if slope is not None:
-        gradient = gradient + penalty * slope
-    at_high, at_low = action.detach() >= high, action.detach() <= low
-    outward = (at_high & (gradient < 0)) | (at_low & (gradient > 0))
-    return torch.where(outward, 0.0, gradient)
+    return at
+
+
+@functools.cache
+def _compiled(function: Callable) -> Callable:
+    """``function`` compiled once for the process, for every shape and risk that it meets."""
+    log.info("Compiling the projection at its first use: this takes about a minute.")
+    return torch.compile(function, dynamic=False)
 
 
 def project(
@@ -59,6 +125,7 @@ def project(
     keep: str = "last",
     low: float = -1.0,
     high: float = 1.0,
+    compile: bool = False,
 ) -> ProjectionResult:
     """Moves risky actions until their risk is at most ``limit`` (paper, E8 to E10).
 
@@ -86,7 +153,7 @@ def project(
 
     Args:
         risk_fn: maps actions [*B, A] to risks [*B] or [*B, 1], each sample for itself. It must be
-            differentiable in the action; its parameters receive no gradient.
+            differentiable by ``torch.func.grad``; its parameters receive no gradient.
         action: a_init [*B, A], in the units of ``low`` and ``high``.
         limit: d_thres, the largest allowed risk.
         steps: N_iter, the largest number of steps.
@@ -96,6 +163,8 @@ def project(
             ``"safest"``, the one of least risk, a_init included.
         low: lower end of the box, for every coordinate.
         high: upper end of the box.
+        compile: whether to compile the steps, several of them into one function; each shape of
+            ``action`` is compiled once. The result is the same up to rounding.
 
     Returns:
         A :class:`ProjectionResult`, detached.
@@ -114,52 +183,28 @@ def project(
                 [0.1000, 0.3000]]), tensor([15,  0]))
     """
     _check_arguments(limit, steps, step_size, penalty, keep, low, high)
-    action = action.detach()
-
-    def evaluate(point: Tensor) -> tuple[Tensor, Tensor]:
-        with torch.enable_grad():
-            point = point.detach().requires_grad_()
-            risk = risk_fn(point)
-            if risk.shape == (*action.shape[:-1], 1):
-                risk = risk.squeeze(-1)
-        if risk.shape != action.shape[:-1]:
-            raise ValueError(
-                f"risk_fn must return a risk of shape {tuple(action.shape[:-1])} or "
-                f"{(*action.shape[:-1], 1)} for actions of shape {tuple(action.shape)}, got "
-                f"{tuple(risk.shape)}."
-            )
-        return point, risk
-
-    point, risk = evaluate(action)
-    risk_before = risk.detach()
-    active = risk_before > limit
-    current, count = action, torch.zeros_like(risk_before, dtype=torch.int64)
-    safest, least = action, risk_before
-    for _ in range(steps):
-        if not active.any():
+    start = action.detach()
+    evaluate, descend, together = _evaluate, _descend, 1
+    if compile:
+        evaluate, descend, together = _compiled(_evaluate), _compiled(_descend), _TOGETHER
+    risk_before, slope = evaluate(risk_fn, start)
+    none = torch.zeros_like(risk_before, dtype=torch.int64)
+    at = _Descent(start, slope, risk_before, risk_before > limit, none, start, risk_before)
+    for done in range(0, steps, together):
+        # To ask a GPU would be to wait for it.
+        if start.device.type == "cpu" and not at.active.any():
             break
-        gradient = _descent_gradient(point, action, risk, penalty, low, high)
-        norm = gradient.abs().amax(-1)
-        # A gradient that is not finite cannot say where to go: the sample stops like at g = 0.
-        active = active & (norm > 0) & norm.isfinite()
-        scale = torch.where(active, step_size / norm, 0.0).unsqueeze(-1)
-        moved = (current - scale * gradient).clamp(low, high)
-        current = torch.where(active.unsqueeze(-1), moved, current)
-        count = count + active
-        point, risk = evaluate(current)
-        better = active & (risk.detach() < least)
-        least = torch.where(better, risk.detach(), least)
-        safest = torch.where(better.unsqueeze(-1), current, safest)
-        active = active & (risk.detach() > limit)
+        count = min(together, steps - done)
+        at = descend(risk_fn, at, start, limit, count, step_size, penalty, low, high)
 
-    risk_after = risk.detach()
+    current, risk_after = at.action, at.risk
     if keep == "safest":
         stuck = (risk_after > limit) | risk_after.isnan()
-        current = torch.where(stuck.unsqueeze(-1), safest, current)
-        risk_after = torch.where(stuck, least, risk_after)
-    intervened = (current != action).any(-1)
+        current = torch.where(stuck.unsqueeze(-1), at.safest, current)
+        risk_after = torch.where(stuck, at.least, risk_after)
+    intervened = (current != start).any(-1)
     return ProjectionResult(
-        current, risk_before, risk_after, count, intervened, risk_after <= limit
+        current, risk_before, risk_after, at.steps, intervened, risk_after <= limit
     )
 
 

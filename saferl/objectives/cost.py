@@ -164,7 +164,8 @@ class CostCriticLoss(LossModule):
         self, critic: TensorDictModule, params: TensorDictBase, tensordict: TensorDictBase
     ) -> BoundCritics:
         """All members of a critic in the batch's states."""
-        key, vmap = self.tensor_keys.action, not self.deactivate_vmap
+        vmap = False if self.deactivate_vmap else None
+        key = self.tensor_keys.action
         return BoundCritics.of(critic, params, tensordict, action_key=key, vmap=vmap)
 
     def cost_loss(

@@ -13,6 +13,7 @@ from torchrl.modules import ValueOperator
 from torchrl.objectives import SACLoss
 
 from saferl.modules import (
+    BoundCritics,
     CriticEnsemble,
     MLPPolicyEncoder,
     MLPValue,
@@ -72,6 +73,21 @@ def test_equals_members_one_by_one(reduce, members, batch):
     (slope,) = torch.autograd.grad(bound.sum(), action)
     (full,) = torch.autograd.grad(ensemble(td.copy().set("action", action))[KEY].sum(), action)
     torch.testing.assert_close(slope, full)
+
+
+@pytest.mark.parametrize("members", [critics("mmam", 3), critics("mlp"), plain_critics()])
+def test_at_once_and_one_by_one(members):
+    """The members stacked, as on a GPU, give the values and gradients that they give in turn."""
+    ensemble, td = CriticEnsemble(members), scene()
+    results = []
+    for vmap in (True, False):
+        bound = BoundCritics.of(ensemble.template, ensemble.params, td, vmap=vmap)
+        action = td["action"].clone().requires_grad_()
+        (bound.values(action) * bound.detach().values(action)).sum().backward()
+        grads = [leaf.grad for leaf in ensemble.parameters()]
+        ensemble.zero_grad(set_to_none=True)
+        results.append([bound.values(action), action.grad, *grads])
+    torch.testing.assert_close(*results)
 
 
 def test_owned_parameters_are_a_copy_that_trains():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,6 +15,7 @@ from torchrl.envs.transforms import Transform
 from saferl.modules.projection import project
 
 _STASH = "_safety_projection"
+_ROWS = 32  # corrected together in compiled code
 _REPORT = {
     "risk_before": torch.float32,
     "risk_after": torch.float32,
@@ -47,6 +48,7 @@ class SafetyProjector(Transform):
         high: upper end of the action box.
         start: fraction of a run after which the correction acts, see :meth:`set_progress`; with 0
             it acts from the first step on, as printed in Algorithm 1.
+        compile: whether the correction is compiled, in parts of at most 32 states.
         action_key: the entry of the proposed action.
 
     Reads the action and the observation at the time of a step. Writes under ``next``:
@@ -89,6 +91,7 @@ class SafetyProjector(Transform):
         low: float = -1.0,
         high: float = 1.0,
         start: float = 0.0,
+        compile: bool = False,
         action_key: NestedKey = "action",
     ):
         super().__init__()
@@ -106,6 +109,7 @@ class SafetyProjector(Transform):
         }
         # Refuses bad settings now and not in the middle of a run.
         project(lambda action: action.sum(-1), torch.zeros(0, 1), self.limit, **self.settings)
+        self.settings["compile"] = compile
         self.start = float(start)
         self.action_key = unravel_key(action_key)
         self.register_buffer("enabled", torch.tensor(start == 0.0))
@@ -123,20 +127,35 @@ class SafetyProjector(Transform):
         key = self.risk.out_keys[0]
         return lambda action: self.risk(inputs.copy().set(self.action_key, action)).get(key)
 
+    def _in_parts(self, risky: Tensor) -> Sequence[Tensor]:
+        """The rows to correct. A GPU corrects all at once, where the others stay as they are, rather
+        than wait to know which; compiled code gets always as many, the last ones more than once."""
+        if risky.device.type != "cpu":
+            return [torch.arange(len(risky), device=risky.device)]
+        rows = risky.nonzero().squeeze(-1)
+        if not len(rows):
+            return []
+        if not self.settings["compile"]:
+            return [rows]
+        size = min(len(risky), _ROWS)
+        missing = -len(rows) % size
+        return torch.cat([rows, rows[-1:].expand(missing)]).split(size)
+
     @torch.no_grad()
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         inputs = tensordict.select(*self.risk.in_keys).reshape(-1)
         action = inputs.get(self.action_key)
 
-        before = self._risk_of_action(inputs)(action).reshape(-1)
+        risk = self._risk_of_action(inputs)
+        before = risk(action).reshape(-1)
         executed, after, steps = action.clone(), before.clone(), torch.zeros_like(before)
-        if self.enabled and (risky := before > self.limit).any():
-            # Only the risky samples are worth up to `steps` evaluations.
-            result = project(
-                self._risk_of_action(inputs[risky]), action[risky], self.limit, **self.settings
-            )
-            executed[risky], after[risky] = result.action, result.risk_after
-            steps[risky] = result.steps.to(steps)
+        if self.enabled:
+            for rows in self._in_parts(before > self.limit):
+                # Only the risky samples are worth up to `steps` evaluations.
+                risk = risk if len(rows) == len(before) else self._risk_of_action(inputs[rows])
+                result = project(risk, action[rows], self.limit, **self.settings)
+                executed[rows], after[rows] = result.action, result.risk_after
+                steps[rows] = result.steps.to(steps)
 
         report = TensorDict(
             {
