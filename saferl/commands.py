@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import statistics
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
@@ -56,8 +57,7 @@ def train(cfg: DictConfig) -> None:
             (run / CONFIG).unlink(missing_ok=True)
 
     settings = cfg.evaluation
-    if "compile_physics" in cfg.env:  # the closing test is over before compiling would pay
-        cfg = OmegaConf.merge(cfg, {"env": {"compile_physics": False}})  # pyright: ignore
+    cfg = compiling(cfg, False)  # the closing test is over before compiling would pay
     try:
         measure(
             cfg,
@@ -134,6 +134,15 @@ def export(cfg: DictConfig) -> None:
     log.info("%s: %.1f MiB. Test it: python -m saferl.evaluate checkpoint=%s", folder, size, folder)
 
 
+def compiling(cfg: DictConfig, on: bool) -> DictConfig:
+    """A run's configuration with the physics and the projection compiled or not, as far as it has them."""
+    cfg = cfg.copy()
+    for part, key in (("env", "compile_physics"), ("projector", "compile")):
+        if key in cfg[part]:
+            cfg[part][key] = on
+    return cfg
+
+
 def trained_policy(cfg: DictConfig, path: Path) -> tuple[TensorDictModuleBase, list[Transform]]:
     """The policy of a run or checkpoint, with the projector that it drives with.
 
@@ -208,7 +217,7 @@ def choose_policy(
             f"task.rows must be {rows}, the number that this policy's MLP was trained with, "
             f"got {cfg.task.rows}."
         )
-    policy, transforms = trained_policy(trained, path)
+    policy, transforms = trained_policy(compiling(trained, cfg.compile), path)
     return cfg, policy, transforms if cfg.project else [], f"{trained.algo_name} ({name})"
 
 
@@ -228,8 +237,10 @@ def measure(
     most = scenario.traffic.vehicles[1]
     env = build_env(cfg, scenario, envs_at_once(episodes, num_envs), seed, *transforms)
     rows = play_episodes(policy, env, episodes, seed)
+    latencies: list[float] = []
     for transform in transforms:  # free for another environment
         transform.reset_parent()
+        latencies += getattr(transform, "latencies", [])
     backend = cfg.env._target_.rpartition(".")[2]
     figures = write(
         rows,
@@ -243,9 +254,18 @@ def measure(
         reading=scenario.reward.reading,
         policy_frequency=scenario.policy_frequency,
         project=bool(transforms),
+        projection_ms=1e3 * statistics.median(latencies) if latencies else None,
         episodes=episodes,
         seed=seed,
     )
+    if latencies:
+        log.info(
+            "A correction took %.1f ms (median of %d, longest %.1f ms; %d episodes at once).",
+            1e3 * statistics.median(latencies),
+            len(latencies),
+            1e3 * max(latencies),
+            env.batch_size[0],
+        )
     title = f"{policy_name}: {episodes} episodes of {scenario.task}, {most} vehicles"
     log.info("\n%s\nFiles: %s", table(figures, title), out)
     return rows

@@ -22,7 +22,7 @@ from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, Transform, Transformed
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 from saferl.envs.transforms import ExecutedAction, SafetyProjector
-from saferl.modules import CriticEnsemble, MLPValue, value_operator
+from saferl.modules import CriticEnsemble, MLPValue, MMAMValue, projection, value_operator
 
 LIMIT = 0.2
 REPORT = {
@@ -326,6 +326,32 @@ def test_reads_the_live_critic():
         with torch.no_grad():
             for p in ensemble.parameters():
                 p.add_(0.3 * torch.randn_like(p))
+
+
+@pytest.mark.parametrize(
+    "backend",
+    # The capture alone takes seconds; generating code takes up to a minute.
+    ["eager", pytest.param("inductor", marks=pytest.mark.slow)],
+)
+@pytest.mark.parametrize("batch", [1, 40])
+def test_compiled_in_parts(monkeypatch, backend, batch):
+    """More states than one part holds, some of them safe, corrected as without compiling."""
+    build = functools.partial(torch.compile, dynamic=False, backend=backend)
+    monkeypatch.setattr(projection, "_compiled", functools.cache(build))
+    torch.manual_seed(0)
+    ensemble = CriticEnsemble([value_operator(MMAMValue(16), out_key="risk") for _ in range(2)])
+    states = TensorDict(
+        ego=torch.randn(batch, 9), vehicles=torch.ones(batch, 3, 6), batch_size=batch
+    )
+    states["action"] = torch.rand(batch, 2) * 2 - 1
+    limit = ensemble(states.copy())["risk"].mean().item() - (batch == 1)
+    forms = [SafetyProjector(ensemble, limit, penalty=10.0, compile=c) for c in (False, True)]
+    plain, compiled = (form._inv_call(states.copy())["_safety_projection"] for form in forms)
+    changed = int(plain["intervened"].sum())
+    assert changed == 1 if batch == 1 else 10 < changed < 40
+    for key, value in plain.items():
+        torch.testing.assert_close(compiled[key], value, rtol=0, atol=1e-5)
+    assert [len(form.latencies) for form in forms] == [1, 1]
 
 
 def test_settings_are_checked_at_once():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from collections import deque
 from collections.abc import Callable, Sequence
 
 import torch
@@ -50,6 +52,10 @@ class SafetyProjector(Transform):
             it acts from the first step on, as printed in Algorithm 1.
         compile: whether the correction is compiled, in parts of at most 32 states.
         action_key: the entry of the proposed action.
+
+    Attributes:
+        latencies: seconds that each of the last 10,000 corrections took, of all risky states of a step
+            together (on a GPU: to queue them).
 
     Reads the action and the observation at the time of a step. Writes under ``next``:
     ``action_executed`` [*B, A]; ``risk_before`` and ``risk_after`` [*B, 1], the risks of the
@@ -110,6 +116,7 @@ class SafetyProjector(Transform):
         # Refuses bad settings now and not in the middle of a run.
         project(lambda action: action.sum(-1), torch.zeros(0, 1), self.limit, **self.settings)
         self.settings["compile"] = compile
+        self.latencies = deque[float](maxlen=10_000)
         self.start = float(start)
         self.action_key = unravel_key(action_key)
         self.register_buffer("enabled", torch.tensor(start == 0.0))
@@ -149,13 +156,16 @@ class SafetyProjector(Transform):
         risk = self._risk_of_action(inputs)
         before = risk(action).reshape(-1)
         executed, after, steps = action.clone(), before.clone(), torch.zeros_like(before)
-        if self.enabled:
-            for rows in self._in_parts(before > self.limit):
+        parts = self._in_parts(before > self.limit) if self.enabled else []
+        if len(parts):
+            begin = time.perf_counter()
+            for rows in parts:
                 # Only the risky samples are worth up to `steps` evaluations.
                 risk = risk if len(rows) == len(before) else self._risk_of_action(inputs[rows])
                 result = project(risk, action[rows], self.limit, **self.settings)
                 executed[rows], after[rows] = result.action, result.risk_after
                 steps[rows] = result.steps.to(steps)
+            self.latencies.append(time.perf_counter() - begin)
 
         report = TensorDict(
             {

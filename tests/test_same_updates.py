@@ -1,0 +1,100 @@
+"""The forms of an update that differ in speed learn the same thing."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import torch._inductor.config
+from small import compose
+from tensordict import TensorDict
+from torchrl.objectives import SoftUpdate
+
+from saferl.builders import build_agent, build_optimizer
+from saferl.learner import Learner
+
+PLAIN = (
+    "encoder.policy._target_=saferl.modules.PlainMMAMPolicyEncoder",
+    "encoder.value._target_=saferl.modules.PlainMMAMValue",
+)
+LOSSES = ("loss_actor", "loss_qvalue", "loss_cost", "loss_alpha")
+
+
+@pytest.fixture
+def double():
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(before)
+
+
+def learner(*overrides: str, compile: bool = False) -> Learner:
+    """ARSAC with width 16 in float64, always with the same first weights."""
+    cfg = compose("algo=arsac", "encoder.policy.width=16", "device=cpu", *overrides)
+    torch.manual_seed(0)
+    loss = build_agent(cfg).loss.double()
+    with torch.no_grad():  # cost critics begin at zero, which would hide what they do
+        for name, parameter in loss.named_parameters():
+            if "w_mlp" in name or "w_attn" in name:
+                parameter.normal_(std=0.3)
+    return Learner(loss, build_optimizer(cfg, loss), SoftUpdate(loss, tau=cfg.tau), compile=compile)
+
+
+def batch(seed: int) -> TensorDict:
+    generator = torch.Generator().manual_seed(seed)
+
+    def scene():
+        vehicles = torch.randn(32, 11, 6, generator=generator) * 10
+        count = torch.randint(0, 11, (32, 1), generator=generator)
+        vehicles[..., 0] = (torch.arange(11) < count).to(vehicles)
+        return {"ego": torch.randn(32, 9, generator=generator) * 5, "vehicles": vehicles}
+
+    ended = torch.rand(32, 1, generator=generator) < 0.1
+    following = {
+        **scene(),
+        "reward": torch.randn(32, 1, generator=generator),
+        "cost": torch.rand(32, 1, generator=generator),
+        "done": ended,
+        "terminated": ended,
+    }
+    action = torch.rand(32, 2, generator=generator) * 2 - 1
+    return TensorDict({**scene(), "action": action, "next": following}, [32])
+
+
+def losses_and_gradients(learner: Learner) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    torch.manual_seed(1)
+    output = learner._forward(batch(0))  # not update(), which clears the gradients
+    terms = torch.stack([output[key] for key in LOSSES])
+    terms.sum().backward()
+    return terms.detach(), [p.grad for p in learner.loss.parameters()]
+
+
+FORMS = [
+    pytest.param({}, (), id="keys and branch by default"),
+    pytest.param({}, ("+encoder.policy.keys=embedded", "+encoder.value.branch=scene"), id="others"),
+    pytest.param({"compile": True}, (), id="compiled", marks=pytest.mark.slow),
+]
+
+
+@pytest.mark.parametrize(("how", "options"), FORMS)
+def test_losses_and_gradients_equal_the_plain_ones(double, how, options):
+    """In float64 to 1e-10."""
+    with torch._inductor.config.patch(fallback_random=True):  # or it would draw its own numbers
+        ours = losses_and_gradients(learner(*options, **how))
+    plain = losses_and_gradients(learner(*options, *PLAIN))
+    torch.testing.assert_close(ours, plain, rtol=1e-10, atol=1e-10)
+
+
+def test_a_hundred_updates_equal_the_plain_ones(double):
+    """From one seed, in float64, to 1e-6 of each parameter's size."""
+    ends = []
+    for one in (learner(), learner(*PLAIN)):
+        torch.manual_seed(2)
+        for step in range(100):
+            one.update(batch(step))
+        ends.append(one.loss.state_dict())
+    ours, plain = ends
+    assert ours.keys() == plain.keys()
+    for key, value in ours.items():
+        if isinstance(value, torch.Tensor) and value.is_floating_point():
+            scale = value.abs().max().clamp(min=1e-3)
+            assert (value - plain[key]).abs().max() <= 1e-6 * scale, key
