@@ -16,36 +16,16 @@ at every number of every step for one that is not finite, and prints the process
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
-import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
 
-import gymnasium
-import highway_env  # noqa: F401  (registers intersection-v1)
 import torch
+from highway import deciding, stock
+from side_by_side import alternate, conditions, medians, parser, write
 
 from saferl.envs.intersection import BatchedIntersection, Scenario
-
-CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
-
-
-def stock() -> Callable[[], int]:
-    config = {"simulation_frequency": 15, "policy_frequency": 5, "initial_vehicle_count": 10}
-    env = gymnasium.make("intersection-v1", config=config)
-    env.action_space.seed(0)
-    env.reset(seed=0)
-
-    def decide() -> int:
-        _, _, terminated, truncated, _ = env.step(env.action_space.sample())
-        if terminated or truncated:
-            env.reset()
-        return 1
-
-    return decide
 
 
 class Ours:
@@ -94,49 +74,34 @@ def soak(one: Ours, decisions: int) -> dict[str, float]:
     return memory
 
 
-def rate(decide: Callable[[], int], seconds: float, clock: str, device: str) -> float:
-    now, count = CLOCKS[clock], 0
-    begin = now()
-    while now() - begin < seconds or count == 0:
-        count += decide()
-    if device == "cuda":
-        torch.cuda.synchronize()
-    return count / (now() - begin)
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--batches", type=int, nargs="+", default=[1, 256, 1024, 4096])
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--seconds", type=float, default=3.0, help="of each in a round")
-    parser.add_argument("--clock", choices=list(CLOCKS), default="wall")
-    parser.add_argument("--soak", type=int, default=0, metavar="DECISIONS")
-    parser.add_argument("--json", type=Path, help="write the figures here")
-    options = parser.parse_args()
-    torch.set_num_threads(1)
+    args = parser(__doc__)
+    args.add_argument("--batches", type=int, nargs="+", default=[1, 256, 1024, 4096])
+    args.add_argument("--soak", type=int, default=0, metavar="DECISIONS")
+    options = args.parse_args()
+    torch.set_num_threads(options.threads)
 
     ours = [
         Ours(batch, compiled, options.device)
         for batch in options.batches
         for compiled in (False, True)
     ]
-    sides: dict[str, Callable[[], int]] = {"stock": stock(), **{one.name: one for one in ours}}
-    rates: dict[str, list[float]] = {name: [] for name in sides}
-    for _ in range(options.rounds):
-        for name, decide in sides.items():
-            rates[name].append(rate(decide, options.seconds, options.clock, options.device))
-    medians = {name: statistics.median(values) for name, values in rates.items()}
+    sides: dict[str, Callable[[], int]] = {
+        "stock": deciding(stock()),
+        **{one.name: one for one in ours},
+    }
+    rates = alternate(sides, options)
+    speed_of = medians(rates)
 
-    print(f"load {os.getloadavg()[0]:.1f}, {options.clock} clock, {options.rounds} rounds")
+    print(conditions(options))
     print(
         f"{'':16s}{'decisions/s':>12s}{'ratio':>8s}{'us each':>9s}{'first step':>12s}{'state':>9s}"
     )
-    print(f"{'stock':16s}{medians['stock']:12.1f}{1.0:8.1f}{1e6 / medians['stock']:9.1f}")
-    result = {"stock": medians["stock"], "clock": options.clock, "rounds": rates}
+    print(f"{'stock':16s}{speed_of['stock']:12.1f}{1.0:8.1f}{1e6 / speed_of['stock']:9.1f}")
+    result = {"stock": speed_of["stock"], "conditions": conditions(options), "rounds": rates}
     for one in ours:
-        speed = medians[one.name]
-        ratio = speed / medians["stock"]
+        speed = speed_of[one.name]
+        ratio = speed / speed_of["stock"]
         print(
             f"{one.name:16s}{speed:12.0f}{ratio:8.0f}{1e6 / speed:9.1f}{one.first_step:10.1f} s"
             f"{one.megabytes:6.1f} MB"
@@ -157,9 +122,7 @@ def main() -> None:
         result["soak"] = soak(ours[-1], options.soak)
         memory = ", ".join(f"{key} {value:.0f}" for key, value in result["soak"].items())
         print(f"{options.soak} decisions, {ours[-1].name}: every number finite, {memory}")
-    if options.json:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(json.dumps(result, indent=2) + "\n")
+    write(options.json, result)
 
 
 if __name__ == "__main__":
