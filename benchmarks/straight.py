@@ -79,6 +79,8 @@ class StraightSACLag:
         cost_limit: d, the bound on the cost critics' value.
         compile: compile the losses of the critics and of the actor, which is faster than to compile
             ``update``: that breaks at every ``zero_grad``, ``backward`` and fused ``step``.
+        tuned: freeze the critics in the actor's step and learn the temperature from its sample.
+            CleanRL's SAC computes the critics' gradients there, to throw them away, and draws again.
     """
 
     def __init__(
@@ -89,7 +91,9 @@ class StraightSACLag:
         tau: float = 0.005,
         cost_limit: float = 0.05,
         compile: bool = False,
+        tuned: bool = False,
     ):
+        self.tuned = tuned
         self.gamma, self.tau, self.cost_limit = gamma, tau, cost_limit
         self.scale = torch.tensor(EGO_SCALE + rows * VEHICLE_SCALE)
 
@@ -170,14 +174,16 @@ class StraightSACLag:
         (loss_q + loss_c).backward()
         self.critic_optimizer.step()
 
-        # The critics are fixed here: their gradients would be thrown away.
-        self.critics.requires_grad_(False)
+        self.critics.requires_grad_(not self.tuned)
         loss_actor, log_prob, violation = self.actor_loss(obs, alpha, self.multiplier, noise)
         self.actor_optimizer.zero_grad()
         loss_actor.backward()
         self.actor_optimizer.step()
         self.critics.requires_grad_(True)
 
+        if not self.tuned:
+            with torch.no_grad():
+                _, log_prob = self.actor.sample(obs, torch.randn_like(noise))
         loss_alpha = -(self.log_alpha.exp() * (log_prob + self.target_entropy)).mean()
         self.alpha_optimizer.zero_grad()
         loss_alpha.backward()

@@ -8,8 +8,8 @@ batch. The sides take turns in one process:
 
 - ARSAC with MMAM as printed (``PlainMMAMPolicyEncoder``, ``PlainMMAMValue``), with ours, and with ours
   compiled;
-- SAC-Lag on MLPs, ours and a straight PyTorch implementation (``benchmarks/straight.py``), each eager
-  and compiled;
+- SAC-Lag on MLPs, ours and a straight PyTorch implementation (``benchmarks/straight.py``), as CleanRL
+  writes SAC and tuned, each eager and compiled;
 - SAC on the same MLPs by TorchRL's own loss, for scale: it has no cost critics;
 - OmniSafe's SACLag, where ``--omnisafe`` names the Python of an environment that has it
   (``benchmarks/omnisafe_sac_lag.py`` says how to make one). It has one cost critic where ours has two.
@@ -132,10 +132,11 @@ def main() -> None:
     ours("arsac plain", ["algo=arsac", *PLAIN], both=False)
     ours("arsac", ["algo=arsac"])
     ours("sac_lag", ["algo=sac_lag"])
-    for compile in (False, True):
-        straight = StraightSACLag(width=width, rows=ROWS, compile=compile)
-        name = f"straight sac_lag {'compiled' if compile else 'eager'}"
-        add(name, straight.update, flat, "straight sac_lag eager" if compile else None)
+    for kind, tuned in (("straight", False), ("tuned", True)):
+        for compile in (False, True):
+            straight = StraightSACLag(width=width, rows=ROWS, compile=compile, tuned=tuned)
+            name = f"{kind} sac_lag {'compiled' if compile else 'eager'}"
+            add(name, straight.update, flat, f"{kind} sac_lag eager" if compile else None)
     ours("torchrl sac", ["algo=sac"])
 
     square = torch.randn(1024, 1024, device=device)
@@ -183,6 +184,8 @@ def main() -> None:
         "sac_lag": {
             "ratio_eager_over_plain": ratio("sac_lag eager", "straight sac_lag eager"),
             "ratio_over_plain": ratio("sac_lag compiled", "straight sac_lag compiled"),
+            "ratio_eager_over_tuned": ratio("sac_lag eager", "tuned sac_lag eager"),
+            "ratio_over_tuned": ratio("sac_lag compiled", "tuned sac_lag compiled"),
         },
         "updates_per_second": speed,
         "gflop": flops,

@@ -288,6 +288,7 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         agent.loss,
         build_optimizer(cfg, agent.loss),
         SoftUpdate(agent.loss, tau=cfg.tau),
+        order=cfg.get("update_order", "joint"),  # a run from before this setting has none
         compile=cfg.compile,
     )
     trainer = Trainer(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import statistics
 from collections.abc import Sequence
@@ -254,18 +255,16 @@ def measure(
         reading=scenario.reward.reading,
         policy_frequency=scenario.policy_frequency,
         project=bool(transforms),
-        projection_ms=1e3 * statistics.median(latencies) if latencies else None,
         episodes=episodes,
         seed=seed,
     )
-    if latencies:
-        log.info(
-            "A correction took %.1f ms (median of %d, longest %.1f ms; %d episodes at once).",
-            1e3 * statistics.median(latencies),
-            len(latencies),
-            1e3 * max(latencies),
-            env.batch_size[0],
-        )
     title = f"{policy_name}: {episodes} episodes of {scenario.task}, {most} vehicles"
-    log.info("\n%s\nFiles: %s", table(figures, title), out)
+    log.info("\n%s", table(figures, title))
+    if latencies:  # in a file of its own: the others are the same each time
+        took = {"median": statistics.median(latencies), "longest": max(latencies)}
+        timing = {name: round(1e3 * seconds, 3) for name, seconds in took.items()}
+        timing |= {"corrections": len(latencies), "episodes_at_once": env.batch_size[0]}
+        (out / "latency_ms.json").write_text(json.dumps(timing, indent=2) + "\n")
+        log.info("A correction took %.1f ms, the longest %.1f ms.", *list(timing.values())[:2])
+    log.info("Files: %s", out)
     return rows

@@ -5,12 +5,19 @@ from __future__ import annotations
 import logging
 import warnings
 from collections.abc import Callable
+from itertools import chain
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.objectives import LossModule, SoftUpdate
 
 log = logging.getLogger(__name__)
+
+#: Names of the parameter groups that step together, one after the other.
+ORDERS = {
+    "joint": [("critic", "actor", "alpha")],
+    "sequential": [("critic",), ("actor",), ("alpha",)],
+}
 
 
 class Learner:
@@ -22,7 +29,15 @@ class Learner:
             learning rate, linear in the fraction of the budget that is spent.
         target_updater: soft update of the loss's targets.
         after_update: called with the loss's output after each step (a multiplier, for example).
+        order: ``"joint"``: every term at the same parameters, then one step of all, as TorchRL's
+            losses do. ``"sequential"`` (paper, Algorithm 1): critics, actor and temperature in turn,
+            each at the parameters that the one before left, which evaluates the loss three times.
         compile: compile the loss.
+
+    Raises:
+        ValueError: ``order`` is unknown.
+
+    The groups of the optimizer are called ``"critic"``, ``"actor"`` and ``"alpha"``.
     """
 
     def __init__(
@@ -31,8 +46,12 @@ class Learner:
         optimizer: torch.optim.Optimizer,
         target_updater: SoftUpdate,
         after_update: list[Callable[[TensorDictBase], None]] | None = None,
+        order: str = "joint",
         compile: bool = False,
     ):
+        if order not in ORDERS:
+            raise ValueError(f"order must be one of {', '.join(ORDERS)}, got {order!r}.")
+        self.stages = ORDERS[order]
         self.loss, self.optimizer, self.target_updater = loss, optimizer, target_updater
         self.after_update = after_update or []
         self._forward = loss
@@ -57,11 +76,14 @@ class Learner:
 
     def update(self, batch: TensorDictBase) -> TensorDict:
         """Returns the loss terms and metrics, detached scalars."""
-        losses = self._forward(batch)
-        terms = [value for key, value in losses.items() if key.startswith("loss_")]
-        torch.stack(terms).sum().backward()
-        self.optimizer.step()
-        self.optimizer.zero_grad(set_to_none=True)
+        for names in self.stages:
+            groups = [g["params"] for g in self.optimizer.param_groups if g["name"] in names]
+            losses = self._forward(batch)
+            terms = [value for key, value in losses.items() if key.startswith("loss_")]
+            # Parameters without a gradient stay where they are.
+            torch.stack(terms).sum().backward(inputs=list(chain(*groups)))
+            self.optimizer.step()
+            self.optimizer.zero_grad(set_to_none=True)
         self.target_updater.step()
         for hook in self.after_update:
             hook(losses)
