@@ -70,7 +70,7 @@ def losses_and_gradients(learner: Learner) -> tuple[torch.Tensor, list[torch.Ten
 
 FORMS = [
     pytest.param({}, (), id="keys and branch by default"),
-    pytest.param({}, ("+encoder.policy.keys=embedded", "+encoder.value.branch=scene"), id="others"),
+    pytest.param({}, ("encoder.policy.keys=embedded", "encoder.value.branch=scene"), id="others"),
     pytest.param({"compile": True}, (), id="compiled", marks=pytest.mark.slow),
 ]
 

@@ -289,15 +289,16 @@ class MMAMValue(nn.Module):
         on_ego, joint_on_action, on_pooled = self.joint.weight.tensor_split([width, 2 * width], -1)
         joint = _linear(ego_token, on_ego, self.joint.bias)
         scene = {"query": query, "logits": logits, "readings": _linear(tokens, readout).mT}
+        on_token = [readout, joint_on_action]
         if self.pair is None:
             joint = joint + _linear((vehicle_tokens * share).sum(-2), on_pooled)
         else:
             on_vehicle, on_ego, pair_on_action = self.pair.weight.split(width, dim=-1)
             pair = _linear(vehicle_tokens, on_vehicle, self.pair.bias)
             pair = pair + _linear(ego_token, on_ego).unsqueeze(-2)
-            scene |= {"pair": pair, "share": share}
-            scene |= {"pair_on_action": pair_on_action, "joint_on_pooled": on_pooled}
-        scene |= {"joint": joint, "joint_on_action": joint_on_action, "readout": readout}
+            scene |= {"pair": pair, "share": share, "joint_on_pooled": on_pooled}
+            on_token.append(pair_on_action)
+        scene |= {"joint": joint, "on_token": torch.cat(on_token)}
         scene |= {"action": [self.action.weight, self.action.bias], "w_mlp": self.w_mlp.weight}
         return scene | {"layers": [[layer.weight, layer.bias] for layer in self.layers]}
 
@@ -307,11 +308,15 @@ class MMAMValue(nn.Module):
         token = F.gelu(_linear(action, *scene["action"]))
         logit = (scene["query"] @ token.unsqueeze(-1)).squeeze(-1)
         weights = torch.cat([scene["logits"], logit.unsqueeze(-1)], dim=-1).softmax(-1)
+        heads, width = scene["query"].shape[-2:]
+        # All that reads the action's token reads it in one product.
+        read = _linear(token, scene["on_token"]).tensor_split([heads, heads + width], dim=-1)
+        reading, on_joint, on_pair = read
         y_attn = (weights[..., :-1] * scene["readings"]).sum((-2, -1))
-        y_attn = y_attn + (weights[..., -1] * _linear(token, scene["readout"])).sum(-1)
-        y_mlp = scene["joint"] + _linear(token, scene["joint_on_action"])
+        y_attn = y_attn + (weights[..., -1] * reading).sum(-1)
+        y_mlp = scene["joint"] + on_joint
         if "pair" in scene:
-            pairs = F.gelu(scene["pair"] + _linear(token, scene["pair_on_action"]).unsqueeze(-2))
+            pairs = F.gelu(scene["pair"] + on_pair.unsqueeze(-2))
             pooled = (pairs * scene["share"]).sum(-2)
             y_mlp = y_mlp + _linear(pooled, scene["joint_on_pooled"])
         for weight, bias in scene["layers"]:
