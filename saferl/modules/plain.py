@@ -50,10 +50,11 @@ class PlainMMAMPolicyEncoder(MMAMPolicyEncoder):
         embedded, present = self.tokens(ego, vehicles)
         hop = self.self_attention
         if isinstance(hop, _EgoAttention):
-            parts = (hop.query(embedded), hop.key(embedded), hop.value(embedded))
+            query, key, value = hop.query(embedded), hop.key(embedded), hop.value(embedded)
         else:
-            parts = hop.query_key_value(embedded).chunk(3, dim=-1)
-        attended = embedded + hop.merge(_attend(*parts, present, hop.heads, hop.divisor))
+            query, key, value = hop.query_key_value(embedded).chunk(3, dim=-1)
+        seen = _attend(query, key, value, present, hop.heads, hop.divisor)
+        attended = embedded + hop.merge(seen)
         row = attended[..., 0, :]
         tokens = attended if self.keys == "attended" else embedded
         row = row + _ego_attend(self.ego_attention, row, tokens, present)
@@ -75,7 +76,7 @@ class PlainMMAMValue(MMAMValue):
         True
     """
 
-    encode = None  # not split: an ensemble evaluates it whole for each action
+    encode = None  # pyright: ignore  (not split: an ensemble evaluates it whole for each action)
 
     def forward(self, ego: Tensor, vehicles: Tensor, action: Tensor) -> Tensor:
         tokens, present = self.tokens(ego, vehicles)
