@@ -83,6 +83,7 @@ def main() -> None:
     }
     for run in options.runs:
         cfg = run_config(run)
+        cfg.device = "cpu"
         scenario = hydra.utils.instantiate(cfg.task)
         policies[run.name] = (*trained_policy(cfg, run), {"rows": scenario.rows})
 

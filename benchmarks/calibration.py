@@ -26,6 +26,7 @@ from saferl.evaluation import as_test, play
 @torch.no_grad()
 def calibrate(run: Path, episodes: int, frequency: int) -> dict[str, float]:
     cfg = run_config(run)
+    cfg.device = "cpu"
     agent = load_agent(cfg, run, "checkpoint")
     if not hasattr(agent.loss, "cost_value"):
         raise SystemExit(f"{run}: algo={cfg.algo_name} has no cost critic.")

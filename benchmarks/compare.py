@@ -16,6 +16,8 @@ from pathlib import Path
 
 from saferl.metrics import mean_interval
 
+#: What two tests must have alike; their backends and their number of vehicle rows may differ.
+ALIKE = ("task", "scenario", "traffic", "vehicles", "reading", "policy_frequency", "seed")
 FIGURES = ("success", "hit_vehicle", "left_road", "frozen", "speed", "cost_return")
 
 
@@ -30,6 +32,14 @@ def main() -> None:
     parser.add_argument("b", type=Path, metavar="TEST_B")
     parser.add_argument("--json", type=Path, help="write the figures here")
     options = parser.parse_args()
+    about = [json.loads((path / "metrics.json").read_text()) for path in (options.a, options.b)]
+    differing = [
+        f"{key} {about[0].get(key)} and {about[1].get(key)}"
+        for key in ALIKE
+        if about[0].get(key) != about[1].get(key)
+    ]
+    if differing:
+        raise SystemExit(f"These tests are not of the same task: {', '.join(differing)}.")
     a, b = read(options.a), read(options.b)
     if a.keys() != b.keys():
         raise SystemExit(f"{options.a} and {options.b} are tests of different episodes.")

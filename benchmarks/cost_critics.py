@@ -56,6 +56,7 @@ def main() -> None:
     torch.set_num_threads(1)
     torch.manual_seed(options.seed)
     cfg = run_config(options.run)
+    cfg.device = "cpu"
     actor = load_agent(cfg, options.run, "checkpoint").actor
     env = BatchedIntersection(hydra.utils.instantiate(cfg.task), ENVS, seed=options.seed)
     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):

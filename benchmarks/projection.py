@@ -63,6 +63,7 @@ def main() -> None:
     torch.manual_seed(0)
     cfg = run_config(args.run)
     cfg.device = "cpu"
+    cfg.device = "cpu"
     agent = load_agent(cfg, args.run, "run")
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(cfg.buffer_size), generator=torch.Generator()

@@ -103,6 +103,8 @@ def _unknown_key(key: str, config: str, arguments: list[str]) -> str:
         parent, _, name = parent.rpartition(".")
         node = OmegaConf.select(composed, parent) if parent else composed
     choices = [str(k) for k in node if k != "_target_"]
+    if not choices:  # an empty mapping: what it may hold, its class says
+        return f"unknown key {key!r}; {parent} is empty by default, set it with +{key}=..."
     if "_target_" in node:
         from saferl import validation  # late, as it imports the target
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
 import statistics
@@ -252,6 +253,7 @@ def measure(
         vehicles=most,
         rows=scenario.rows,
         scenario=scenario.scenario,
+        traffic=dataclasses.asdict(scenario.traffic),
         reading=scenario.reward.reading,
         policy_frequency=scenario.policy_frequency,
         project=bool(transforms),

@@ -55,9 +55,14 @@ class CollectorState:
         self._base_env.load_state_dict(state["env"])
         if "transform" in state:
             collector.env.transform.load_state_dict(state["transform"])  # pyright: ignore
-        collector._carrier = TensorDict.from_dict(
+        built = collector._carrier
+        carrier = TensorDict.from_dict(
             state["carrier"], batch_size=collector.env.batch_size, device=collector.env.device
         )
+        # Laid out as the environment lays it out: a product of matrices may round otherwise.
+        for key in set(carrier.keys(True, True)) & set(built.keys(True, True)):
+            carrier[key] = torch.empty_like(built[key]).copy_(carrier[key])
+        collector._carrier = carrier
         collector._frames, collector._iter = state["frames"], state["iter"]
 
 

@@ -195,7 +195,7 @@ def evaluate(
     return [{"episode": i, **row} for i, row in enumerate(rows[:episodes])]
 
 
-def write(rows: list[dict], out: Path, /, **about: str | int | float | None) -> dict:
+def write(rows: list[dict], out: Path, /, **about: Any) -> dict:
     """Write ``episodes.csv`` and ``metrics.json`` into a folder; returns the metrics."""
     out.mkdir(parents=True, exist_ok=True)
     with (out / "episodes.csv").open("w", newline="") as file:

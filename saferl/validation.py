@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import hydra
 from omegaconf import DictConfig, ListConfig, OmegaConf
@@ -151,9 +151,9 @@ def _check_like(node: DictConfig, files: list, prefix: str, known: set | None = 
             )
 
 
-def check_targets(node: Any, path: str = "") -> None:
-    """Check each ``_target_`` below a node against its signature (names and kinds of arguments), and
-    that every number is finite.
+def check_targets(node: Any, path: str = "", kind: Any = None) -> None:
+    """Check each ``_target_`` below a node against its signature (names and kinds of arguments), each
+    mapping that stands for a dataclass (``kind``) against its fields, and that every number is finite.
 
     Raises:
         ValueError: names the key and what is allowed.
@@ -167,6 +167,8 @@ def check_targets(node: Any, path: str = "") -> None:
         return
     target = node.get("_target_")
     accepted = None if target is None else arguments(target)
+    if target is None and is_dataclass(kind):
+        target, accepted = f"{path}, a {kind.__name__},", get_type_hints(kind)  # pyright: ignore
     for key, value in node.items():
         name = f"{path}.{key}".removeprefix(".")
         if accepted is not None and not str(key).startswith("_"):
@@ -176,7 +178,7 @@ def check_targets(node: Any, path: str = "") -> None:
                 )
             if not isinstance(value, DictConfig) and not fits(value, accepted[key]):
                 raise ValueError(f"{name} must be {describe(accepted[key])}, got {value!r}.")
-        check_targets(value, name)
+        check_targets(value, name, (accepted or {}).get(key))
 
 
 def arguments(target: str) -> dict[str, Any] | None:
@@ -219,6 +221,8 @@ def fits(value: Any, kind: Any) -> bool:
         return value in inner
     if origin in (tuple, list, Sequence) and inner[0] in _KINDS:
         listed = isinstance(value, (list, tuple, ListConfig))
+        if origin is tuple and Ellipsis not in inner and listed and len(value) != len(inner):
+            return False
         return listed and all(fits(item, inner[0]) for item in value)
     return not is_dataclass(kind)
 
@@ -234,7 +238,9 @@ def describe(kind: Any) -> str:
     if get_origin(kind) is Literal:
         return " or ".join(map(str, get_args(kind)))
     if get_origin(kind) in (tuple, list, Sequence):
-        return f"a list, each {describe(get_args(kind)[0])}"
+        inner = get_args(kind)
+        size = len(inner) if get_origin(kind) is tuple and Ellipsis not in inner else ""
+        return f"a list of {size}, each {describe(inner[0])}".replace(" of ,", ",")
     if is_dataclass(kind):
         return f"a mapping of {', '.join(field.name for field in fields(kind))}"
     return _KINDS.get(kind, str(kind))

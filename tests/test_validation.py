@@ -18,6 +18,18 @@ from saferl.paths import config_dir
 from saferl.validation import check_training
 
 MISTAKES = [
+    (
+        "+task.traffic.vehicles=ab",
+        "task.traffic.vehicles must be a list of 2, each a whole number, ",
+    ),
+    ("+task.traffic.vehicles=[5.5,6]", "task.traffic.vehicles must be a list of 2, each a whole"),
+    ("+task.traffic.respawn=maybe", "task.traffic.respawn must be true or false, got 'maybe'."),
+    (
+        "+task.traffic.foo=1",
+        "unknown key task.traffic.foo: task.traffic, a Traffic, takes vehicles,",
+    ),
+    ("task.traffic.bias=0", "task.traffic is empty by default, set it with +task.traffic.bias=..."),
+    ("update_order=paper", "update_order must be joint or sequential, got 'paper'."),
     ("lr=3", "lr must be a mapping of actor, critic, alpha, got 3."),
     ("lr=null", "lr must be a mapping of actor, critic, alpha, got None."),
     (
@@ -27,9 +39,9 @@ MISTAKES = [
     ("lagrange.multiplier=3", "lagrange.multiplier must be a mapping of _target_, "),
     ("task.reward=3", "task.reward must be a mapping of reading, risk_shaping, "),
     ("+task.reward.weights=[1,2]", "reward.weights must be 6 numbers, got [1, 2]."),
-    ("+task.reward.energy=[1]", "reward.energy must be 2 numbers, got [1]."),
-    ("+task.reward.smoothness=[1,2,3]", "reward.smoothness must be 2 numbers, got [1, 2, 3]."),
-    ("+task.cost.growth=[1]", "cost.growth must be 2 numbers with 0 < first <= last, got [1]."),
+    ("+task.reward.energy=[1]", "reward.energy must be a list of 2, each a number, got [1]."),
+    ("+task.reward.smoothness=[1,2,3]", "reward.smoothness must be a list of 2, each a number, got [1, 2, 3]."),
+    ("+task.cost.growth=[1]", "cost.growth must be a list of 2, each a number, got [1]."),
     ("+task.cost.growth=[2,1]", "cost.growth must be 2 numbers with 0 < first <= last, got [2, 1]"),
     ("+task.cost.growth=[0,1]", "cost.growth must be 2 numbers with 0 < first <= last, got [0, 1]"),
     ("+task.cost.decay=nan", "task.cost.decay must be finite, got nan."),

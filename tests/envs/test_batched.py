@@ -18,6 +18,7 @@ from torchrl.envs.utils import check_env_specs
 
 from saferl.envs.intersection import BatchedIntersection, Scenario
 from saferl.envs.intersection.base import OUTCOMES
+from saferl.envs.intersection.batched import vehicles_of
 from saferl.envs.intersection.spawning import (
     episode_seeds,
     mix,
@@ -288,3 +289,24 @@ def test_compiled_is_eager(scenario, num_envs):
         assert equal(compiled, eager, ("done", "route", *OUTCOMES))
         resets += int(eager["done"].sum())
     assert resets
+
+
+def test_respawning_keeps_the_number_that_was_drawn():
+    """Vehicles that leave are replaced; an episode never has more than it was drawn with."""
+    fixed = Scenario(task="lt", scenario="dense", traffic={"vehicles": (6, 6)})
+    env = BatchedIntersection(fixed, 16)
+    numbers = []
+    data = env.reset()
+    for _ in range(60):
+        data["action"] = torch.zeros(16, 2)
+        _, data = env.step_and_maybe_reset(data)
+        numbers.append(vehicles_of(env._state).present.sum(0))
+    numbers = torch.stack(numbers)
+    assert numbers.max() == 6 and numbers.float().mean() > 4.5
+
+
+def test_an_action_of_another_precision_changes_no_type():
+    env = BatchedIntersection(Scenario(task="gs"), 2)
+    data = env.reset().set("action", torch.zeros(2, 2, dtype=torch.float64))
+    after = env.step(data)["next"]
+    assert all(after[key].dtype == torch.float32 for key in ("ego", "vehicles", "reward", "cost"))

@@ -283,7 +283,8 @@ class BatchedIntersection(IntersectionBase):
         return self._output(self._observation() | dict.fromkeys(OUTCOMES, no))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self._state, output = self._advance(self.scenario, self._state, tensordict["action"])
+        action = tensordict["action"].to(self._state["ego"])
+        self._state, output = self._advance(self.scenario, self._state, action)
         return self._output(self._observation() | output)
 
     def snapshot(self, index: int) -> tuple[np.ndarray, np.ndarray]:

@@ -54,7 +54,7 @@ class Traffic:
         headways: s, time headway, drawn for each driver; half of it, in proportion, is the time that
             a driver leaves between itself and another one where their routes cross.
         heedless: share of drivers that ignore road priority; they still brake for what is ahead.
-        respawn: a vehicle that has left the road enters again on a free approach.
+        respawn: while there are fewer vehicles than were drawn, one a decision enters a free approach.
         noise: standard deviations of the sensed position (m) and velocity (m/s).
         dropout: chance that a vehicle is not sensed at a decision.
 
@@ -202,6 +202,12 @@ def _draw_drivers(traffic: Traffic, ego_route: Tensor, seed: Tensor) -> Drawn:
     )
 
 
+def _count(traffic: Traffic, seed: Tensor) -> Tensor:
+    """The number of vehicles that an episode is drawn with, int64 [...]."""
+    fewest, most = traffic.vehicles
+    return fewest + (uniform(seed, 5) * (most - fewest + 1)).long()
+
+
 def draw_traffic(traffic: Traffic, ego_route: Tensor, ego: Tensor, seed: Tensor) -> Drawn:
     """Surrounding vehicles of episodes.
 
@@ -219,15 +225,14 @@ def draw_traffic(traffic: Traffic, ego_route: Tensor, ego: Tensor, seed: Tensor)
     >>> draw_traffic(Traffic(), route, draw_start(route, seed, 0.0), seed).s.shape
     torch.Size([3, 10])
     """
-    fewest, most = traffic.vehicles
+    most = traffic.vehicles[1]
     index = torch.arange(most, device=seed.device)
     seeds = mix(mix(seed, _VEHICLES)[..., None] + index, 0)
     drawn = _draw_drivers(traffic, ego_route, seeds)
     s = traffic.spawn_length * uniform(seeds, 1)
     position = torch.stack(lane_frames(lanes(drawn.route, s), s)[0][:2], -1)
-    count = fewest + (uniform(seed, 5) * (most - fewest + 1)).long()
     far = (position - ego[..., None, :2]).norm(dim=-1) >= traffic.ego_gap
-    wanted = far & (index < count[..., None])
+    wanted = far & (index < _count(traffic, seed)[..., None])
     apart = (position[..., :, None, :] - position[..., None, :, :]).norm(dim=-1)
     earlier = (apart < traffic.gap) & (index < index[:, None])
     present = wanted
@@ -247,7 +252,8 @@ def enter(
     route: Tensor,
     s: Tensor,
 ) -> Drawn:
-    """With ``respawn``, lets one absent vehicle a decision onto the road, if its approach is free.
+    """With ``respawn``, lets one vehicle a decision onto the road while there are fewer than the episode
+    was drawn with, if its approach is free.
 
     Args:
         ego_route, seed, steps: int64 [...]; steps counts the decisions of the episode.
@@ -259,7 +265,8 @@ def enter(
     fresh = _draw_drivers(traffic, ego_route, mix(seed, _ENTRIES + steps)[..., None])
     same = lanes(route, s).approach == lanes(fresh.route, s).approach
     free = (torch.where(present & same, s, torch.inf) >= traffic.gap).all(-1, keepdim=True)
-    first = ~present & ((~present).cumsum(-1) == 1)
+    fewer = present.sum(-1, keepdim=True) < _count(traffic, seed)[..., None]
+    first = ~present & ((~present).cumsum(-1) == 1) & fewer
     return Drawn(first & free, *(value.expand(first.shape) for value in fresh[1:]))
 
 
