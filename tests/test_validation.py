@@ -40,7 +40,10 @@ MISTAKES = [
     ("task.reward=3", "task.reward must be a mapping of reading, risk_shaping, "),
     ("+task.reward.weights=[1,2]", "reward.weights must be 6 numbers, got [1, 2]."),
     ("+task.reward.energy=[1]", "reward.energy must be a list of 2, each a number, got [1]."),
-    ("+task.reward.smoothness=[1,2,3]", "reward.smoothness must be a list of 2, each a number, got [1, 2, 3]."),
+    (
+        "+task.reward.smoothness=[1,2,3]",
+        "reward.smoothness must be a list of 2, each a number, got [1, 2, 3].",
+    ),
     ("+task.cost.growth=[1]", "cost.growth must be a list of 2, each a number, got [1]."),
     ("+task.cost.growth=[2,1]", "cost.growth must be 2 numbers with 0 < first <= last, got [2, 1]"),
     ("+task.cost.growth=[0,1]", "cost.growth must be 2 numbers with 0 < first <= last, got [0, 1]"),
