@@ -178,7 +178,7 @@ def check_targets(node: Any, path: str = "", kind: Any = None) -> None:
                 )
             if not isinstance(value, DictConfig) and not fits(value, accepted[key]):
                 raise ValueError(f"{name} must be {describe(accepted[key])}, got {value!r}.")
-        check_targets(value, name, (accepted or {}).get(key))
+        check_targets(value, name, (accepted or {}).get(str(key)))
 
 
 def arguments(target: str) -> dict[str, Any] | None:
