@@ -134,7 +134,8 @@ def main() -> None:
     ours("sac_lag", ["algo=sac_lag"])
     for kind, tuned in (("straight", False), ("tuned", True)):
         for compile in (False, True):
-            straight = StraightSACLag(width=width, rows=ROWS, compile=compile, tuned=tuned)
+            with torch.device(device):
+                straight = StraightSACLag(width=width, rows=ROWS, compile=compile, tuned=tuned)
             name = f"{kind} sac_lag {'compiled' if compile else 'eager'}"
             add(name, straight.update, flat, f"{kind} sac_lag eager" if compile else None)
     ours("torchrl sac", ["algo=sac"])

@@ -239,8 +239,8 @@ def describe(kind: Any) -> str:
         return " or ".join(map(str, get_args(kind)))
     if get_origin(kind) in (tuple, list, Sequence):
         inner = get_args(kind)
-        size = len(inner) if get_origin(kind) is tuple and Ellipsis not in inner else ""
-        return f"a list of {size}, each {describe(inner[0])}".replace(" of ,", ",")
+        size = f" of {len(inner)}" if get_origin(kind) is tuple and Ellipsis not in inner else ""
+        return f"a list{size}, each {describe(inner[0])}"
     if is_dataclass(kind):
         return f"a mapping of {', '.join(field.name for field in fields(kind))}"
     return _KINDS.get(kind, str(kind))

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from batch import reset, reset_rows, step
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
@@ -18,21 +19,6 @@ from saferl.envs.intersection.spawning import draw_route, episode_seeds
 OBSERVATION = ("ego", "vehicles", "route", *OUTCOMES)
 RESULT = (*OBSERVATION, "reward", "cost", "terminated", "truncated", "done")
 BACKENDS = (BatchedIntersection, HighwayIntersection)
-
-
-def reset(env, seeds=None):
-    fields = {"seed": torch.as_tensor(seeds)} if seeds is not None else {}
-    return env.reset(TensorDict(fields, batch_size=env.batch_size))
-
-
-def reset_rows(env, view, rows):
-    mask = torch.as_tensor(rows).reshape(*env.batch_size, 1)
-    return env.reset(view.exclude("reward", "cost").set("_reset", mask))
-
-
-def step(env, action):
-    action = torch.as_tensor(action, dtype=torch.float32).expand(*env.batch_size, 2)
-    return env.step(TensorDict({"action": action}, batch_size=env.batch_size))["next"]
 
 
 def same(a, b, keys=RESULT):
