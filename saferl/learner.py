@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import logging
-import warnings
 from collections.abc import Callable
 from itertools import chain
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.objectives import LossModule, SoftUpdate
+
+from saferl.modules.compiling import compiled
 
 log = logging.getLogger(__name__)
 
@@ -57,16 +58,7 @@ class Learner:
         self._forward = loss
         if compile:
             log.info("Compiling the loss at its first update: this takes about a minute.")
-            self._compiled = torch.compile(loss)
-            self._forward = self._forward_quietly
-
-    def _forward_quietly(self, batch: TensorDictBase) -> TensorDictBase:
-        """Without warnings about how TensorDict compiles, at the first update or a later one."""
-        with warnings.catch_warnings():
-            warnings.filterwarnings(
-                "ignore", category=UserWarning, module="tensordict|torch._dynamo"
-            )
-            return self._compiled(batch)
+            self._forward = compiled(loss)
 
     def schedule(self, spent: float) -> None:
         """Set the learning rates for a fraction of the budget."""

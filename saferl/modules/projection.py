@@ -12,6 +12,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from saferl.modules.compiling import compiled
+
 log = logging.getLogger(__name__)
 
 #: Steps between two looks at whether any sample still moves, in compiled code.
@@ -108,10 +110,10 @@ def _descend(
 
 
 @functools.cache
-def _compiled(function: Callable) -> Callable:
-    """``function`` compiled once for the process, for every shape and risk that it meets."""
+def _compiled() -> tuple[Callable, Callable]:
+    """The two functions compiled once for the process, for every shape and risk that they meet."""
     log.info("Compiling the projection at its first use: this takes about a minute.")
-    return torch.compile(function, dynamic=False)
+    return compiled(_evaluate), compiled(_descend)
 
 
 def project(
@@ -186,7 +188,7 @@ def project(
     start = action.detach()
     evaluate, descend, together = _evaluate, _descend, 1
     if compile:
-        evaluate, descend, together = _compiled(_evaluate), _compiled(_descend), _TOGETHER
+        (evaluate, descend), together = _compiled(), _TOGETHER
     risk_before, slope = evaluate(risk_fn, start)
     none = torch.zeros_like(risk_before, dtype=torch.int64)
     at = _Descent(start, slope, risk_before, risk_before > limit, none, start, risk_before)

@@ -22,6 +22,7 @@ from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, Transform, Transformed
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 from saferl.envs.transforms import ExecutedAction, SafetyProjector
+from saferl.envs.transforms import projector as transform
 from saferl.modules import CriticEnsemble, MLPValue, MMAMValue, projection, value_operator
 
 LIMIT = 0.2
@@ -334,10 +335,12 @@ def test_reads_the_live_critic():
     ["eager", pytest.param("inductor", marks=pytest.mark.slow)],
 )
 @pytest.mark.parametrize("batch", [1, 40])
-def test_compiled_in_parts(monkeypatch, backend, batch):
+def test_compiled_in_parts(monkeypatch, request, backend, batch):
     """More states than one part holds, some of them safe, corrected as without compiling."""
-    build = functools.partial(torch.compile, dynamic=False, backend=backend)
-    monkeypatch.setattr(projection, "_compiled", functools.cache(build))
+    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
+    for once in (projection._compiled, transform._compiled_risk):
+        once.cache_clear()
+        request.addfinalizer(once.cache_clear)
     torch.manual_seed(0)
     ensemble = CriticEnsemble([value_operator(MMAMValue(16), out_key="risk") for _ in range(2)])
     states = TensorDict(

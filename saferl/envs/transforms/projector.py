@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -14,6 +15,7 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
+from saferl.modules.compiling import compiled
 from saferl.modules.projection import project
 
 _STASH = "_safety_projection"
@@ -25,6 +27,26 @@ _REPORT = {
     "intervened": torch.bool,
     "feasible": torch.bool,
 }
+
+
+def _risk_of_action(
+    risk: TensorDictModuleBase, action_key: NestedKey, inputs: TensorDictBase
+) -> tuple[Callable[[Tensor], Tensor], Tensor]:
+    """The risk [N, 1] as a function of the action alone [N, A], and that of the action given [N]."""
+    bind, action = getattr(risk, "bind", None), inputs.get(action_key)
+    if bind is None:
+
+        def of_action(action: Tensor) -> Tensor:
+            return risk(inputs.copy().set(action_key, action)).get(risk.out_keys[0])
+
+    else:
+        of_action = bind(inputs).detach()
+    return of_action, of_action(action).reshape(-1)
+
+
+@functools.cache
+def _compiled_risk() -> Callable:
+    return compiled(_risk_of_action)
 
 
 class SafetyProjector(Transform):
@@ -50,7 +72,7 @@ class SafetyProjector(Transform):
         high: upper end of the action box.
         start: fraction of a run after which the correction acts, see :meth:`set_progress`; with 0
             it acts from the first step on, as printed in Algorithm 1.
-        compile: whether the correction is compiled, in parts of at most 32 states.
+        compile: whether it is compiled, the correction in parts of at most 32 states.
         action_key: the entry of the proposed action.
 
     Attributes:
@@ -125,14 +147,10 @@ class SafetyProjector(Transform):
         """Switches the correction on once ``fraction`` of the run is at least ``start``."""
         self.enabled.fill_(fraction >= self.start)
 
-    def _risk_of_action(self, tensordict: TensorDictBase) -> Callable[[Tensor], Tensor]:
-        """The risk [N, 1] as a function of the action alone [N, A]."""
-        bind = getattr(self.risk, "bind", None)
-        if bind is not None:
-            return bind(tensordict).detach()
-        inputs = tensordict.select(*self.risk.in_keys)
-        key = self.risk.out_keys[0]
-        return lambda action: self.risk(inputs.copy().set(self.action_key, action)).get(key)
+    def _look(self, inputs: TensorDictBase) -> tuple[Callable[[Tensor], Tensor], Tensor]:
+        """What :func:`_risk_of_action` makes of the states and actions in ``inputs`` [N]."""
+        look = _compiled_risk() if self.settings["compile"] else _risk_of_action
+        return look(self.risk, self.action_key, inputs)
 
     def _in_parts(self, risky: Tensor) -> Sequence[Tensor]:
         """The rows to correct. A GPU corrects all at once, where the others stay as they are, rather
@@ -153,15 +171,15 @@ class SafetyProjector(Transform):
         inputs = tensordict.select(*self.risk.in_keys).reshape(-1)
         action = inputs.get(self.action_key)
 
-        risk = self._risk_of_action(inputs)
-        before = risk(action).reshape(-1)
+        risk, before = self._look(inputs)
         executed, after, steps = action.clone(), before.clone(), torch.zeros_like(before)
         parts = self._in_parts(before > self.limit) if self.enabled else []
         if len(parts):
             begin = time.perf_counter()
             for rows in parts:
                 # Only the risky samples are worth up to `steps` evaluations.
-                risk = risk if len(rows) == len(before) else self._risk_of_action(inputs[rows])
+                if len(rows) < len(before):
+                    risk, _ = self._look(inputs[rows])
                 result = project(risk, action[rows], self.limit, **self.settings)
                 executed[rows], after[rows] = result.action, result.risk_after
                 steps[rows] = result.steps.to(steps)

@@ -1,0 +1,32 @@
+"""Compiling of functions that meet TensorDicts."""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from collections.abc import Callable
+
+import torch
+
+
+def compiled(function: Callable) -> Callable:
+    """``function`` compiled, each shape of its inputs anew, without warnings about how TensorDict compiles.
+
+    Args:
+        function: of tensors, TensorDicts and modules.
+
+    Examples:
+        >>> import torch
+        >>> from saferl.modules.compiling import compiled
+        >>> compiled(torch.sin)(torch.zeros(2))
+        tensor([0., 0.])
+    """
+    fast = torch.compile(function, dynamic=False)
+
+    @functools.wraps(function)
+    def quietly(*args, **kwargs):
+        with warnings.catch_warnings():  # at the first call, or at a later one with another shape
+            warnings.filterwarnings("ignore", category=Warning, module="tensordict|torch._dynamo")
+            return fast(*args, **kwargs)
+
+    return quietly
