@@ -37,6 +37,7 @@ from torchrl.objectives import SoftUpdate
 
 from saferl.builders import build_agent, build_optimizer
 from saferl.learner import Learner
+from saferl.modules import compiled
 from saferl.paths import config_dir
 
 ROWS = 11
@@ -100,7 +101,9 @@ def learner(overrides: list[str], device: str, compile: bool) -> Learner:
     torch.manual_seed(0)
     loss = build_agent(cfg).loss
     optimizer = build_optimizer(cfg, loss)
-    return Learner(loss, optimizer, SoftUpdate(loss, tau=cfg.tau), compile=compile)
+    return Learner(
+        loss, optimizer, SoftUpdate(loss, tau=cfg.tau), compile=compiled if compile else None
+    )
 
 
 def main() -> None:

@@ -27,7 +27,7 @@ from saferl.envs.intersection.drivers import CautiousDriver, Driver
 from saferl.envs.transforms import ExecutedAction, SafetyProjector
 from saferl.hooks import ProjectorProgress
 from saferl.learner import Learner
-from saferl.modules import tanh_gaussian_actor, value_operator, zero_output
+from saferl.modules import compiled, tanh_gaussian_actor, value_operator, zero_output
 from saferl.progress import Budget
 from saferl.trainer import Trainer
 from saferl.validation import check_training
@@ -289,7 +289,7 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         build_optimizer(cfg, agent.loss),
         SoftUpdate(agent.loss, tau=cfg.tau),
         order=cfg.get("update_order", "joint"),  # a run from before this setting has none
-        compile=cfg.compile,
+        compile=compiled if cfg.compile else None,
     )
     trainer = Trainer(
         run=run,

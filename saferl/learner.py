@@ -10,8 +10,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.objectives import LossModule, SoftUpdate
 
-from saferl.modules.compiling import compiled
-
 log = logging.getLogger(__name__)
 
 #: Names of the parameter groups that step together, one after the other.
@@ -33,7 +31,7 @@ class Learner:
         order: ``"joint"``: every term at the same parameters, then one step of all, as TorchRL's
             losses do. ``"sequential"`` (paper, Algorithm 1): critics, actor and temperature in turn,
             each at the parameters that the one before left, which evaluates the loss three times.
-        compile: compile the loss.
+        compile: what makes the loss faster, such as :func:`saferl.modules.compiled`; None: nothing.
 
     Raises:
         ValueError: ``order`` is unknown.
@@ -48,7 +46,7 @@ class Learner:
         target_updater: SoftUpdate,
         after_update: list[Callable[[TensorDictBase], None]] | None = None,
         order: str = "joint",
-        compile: bool = False,
+        compile: Callable[[LossModule], Callable] | None = None,
     ):
         if order not in ORDERS:
             raise ValueError(f"order must be one of {', '.join(ORDERS)}, got {order!r}.")
@@ -56,9 +54,9 @@ class Learner:
         self.loss, self.optimizer, self.target_updater = loss, optimizer, target_updater
         self.after_update = after_update or []
         self._forward = loss
-        if compile:
+        if compile is not None:
             log.info("Compiling the loss at its first update: this takes about a minute.")
-            self._forward = compiled(loss)
+            self._forward = compile(loss)
 
     def schedule(self, spent: float) -> None:
         """Set the learning rates for a fraction of the budget."""

@@ -11,6 +11,7 @@ from torchrl.objectives import SoftUpdate
 
 from saferl.builders import build_agent, build_optimizer
 from saferl.learner import Learner
+from saferl.modules import compiled
 
 PLAIN = (
     "encoder.policy._target_=saferl.modules.PlainMMAMPolicyEncoder",
@@ -36,7 +37,12 @@ def learner(*overrides: str, compile: bool = False) -> Learner:
         for name, parameter in loss.named_parameters():
             if "w_mlp" in name or "w_attn" in name:
                 parameter.normal_(std=0.3)
-    return Learner(loss, build_optimizer(cfg, loss), SoftUpdate(loss, tau=cfg.tau), compile=compile)
+    return Learner(
+        loss,
+        build_optimizer(cfg, loss),
+        SoftUpdate(loss, tau=cfg.tau),
+        compile=compiled if compile else None,
+    )
 
 
 def batch(seed: int) -> TensorDict:

@@ -1,6 +1,7 @@
 """Networks, critics, multipliers and the projection that algorithms are composed of."""
 
 from saferl.modules.actors import GaussianHead, tanh_gaussian_actor
+from saferl.modules.compiling import compiled
 from saferl.modules.critics import (
     BoundCritics,
     CriticEnsemble,
@@ -31,6 +32,7 @@ __all__ = [
     "PlainMMAMValue",
     "ProjectionResult",
     "StateValue",
+    "compiled",
     "project",
     "tanh_gaussian_actor",
     "value_operator",

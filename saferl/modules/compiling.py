@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import warnings
 from collections.abc import Callable
 
@@ -17,13 +16,12 @@ def compiled(function: Callable) -> Callable:
 
     Examples:
         >>> import torch
-        >>> from saferl.modules.compiling import compiled
+        >>> from saferl.modules import compiled
         >>> compiled(torch.sin)(torch.zeros(2))
         tensor([0., 0.])
     """
     fast = torch.compile(function, dynamic=False)
 
-    @functools.wraps(function)
     def quietly(*args, **kwargs):
         with warnings.catch_warnings():  # at the first call, or at a later one with another shape
             warnings.filterwarnings("ignore", category=Warning, module="tensordict|torch._dynamo")
