@@ -86,9 +86,8 @@ def main() -> None:
     load = os.getloadavg()[0]
     # One thread waits for nobody.
     settings = [
-        (threads, spin) for threads in options.threads for spin in options.spins if threads > 1
+        (n, spin) for n in options.threads for spin in options.spins[: None if n > 1 else 1]
     ]
-    settings = [(1, options.spins[0]), *settings]
     rates: dict[tuple, list[float]] = {}
     for _ in range(options.rounds):
         for algo in options.algos:

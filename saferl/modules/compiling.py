@@ -24,7 +24,7 @@ def compiled(function: Callable) -> Callable:
 
     def quietly(*args, **kwargs):
         with warnings.catch_warnings():  # at the first call, or at a later one with another shape
-            warnings.filterwarnings("ignore", category=Warning, module="tensordict|torch._dynamo")
+            warnings.filterwarnings("ignore", module="tensordict|torch._dynamo")
             return fast(*args, **kwargs)
 
     return quietly

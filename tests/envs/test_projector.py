@@ -334,7 +334,7 @@ def test_reads_the_live_critic():
     # The capture alone takes seconds; generating code takes up to a minute.
     ["eager", pytest.param("inductor", marks=pytest.mark.slow)],
 )
-@pytest.mark.parametrize("batch", [1, 40])
+@pytest.mark.parametrize("batch", [1, 8, 40])
 def test_compiled_in_parts(monkeypatch, request, backend, batch):
     """More states than one part holds, some of them safe, corrected as without compiling."""
     monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
@@ -351,7 +351,7 @@ def test_compiled_in_parts(monkeypatch, request, backend, batch):
     forms = [SafetyProjector(ensemble, limit, penalty=10.0, compile=c) for c in (False, True)]
     plain, compiled = (form._inv_call(states.copy())["_safety_projection"] for form in forms)
     changed = int(plain["intervened"].sum())
-    assert changed == 1 if batch == 1 else 10 < changed < 40
+    assert changed == 1 if batch == 1 else batch / 4 < changed < batch
     for key, value in plain.items():
         torch.testing.assert_close(compiled[key], value, rtol=0, atol=1e-5)
     assert [len(form.latencies) for form in forms] == [1, 1]

@@ -152,17 +152,20 @@ class SafetyProjector(Transform):
         look = _compiled_risk() if self.settings["compile"] else _risk_of_action
         return look(self.risk, self.action_key, inputs)
 
-    def _in_parts(self, risky: Tensor) -> Sequence[Tensor]:
-        """The rows to correct. A GPU corrects all at once, where the others stay as they are, rather
-        than wait to know which; compiled code gets always as many, the last ones more than once."""
+    def _in_parts(self, risky: Tensor) -> Sequence[Tensor | slice]:
+        """The rows to correct, a slice where these are all. A GPU corrects all at once, where the
+        others stay as they are, rather than wait to know which; compiled code gets always as many,
+        the last ones more than once."""
         if risky.device.type != "cpu":
-            return [torch.arange(len(risky), device=risky.device)]
+            return [slice(None)]
+        size = min(len(risky), _ROWS) if self.settings["compile"] else len(risky)
         rows = risky.nonzero().squeeze(-1)
         if not len(rows):
             return []
+        if len(rows) == size == len(risky):
+            return [slice(None)]
         if not self.settings["compile"]:
             return [rows]
-        size = min(len(risky), _ROWS)
         missing = -len(rows) % size
         return torch.cat([rows, rows[-1:].expand(missing)]).split(size)
 
@@ -178,7 +181,7 @@ class SafetyProjector(Transform):
             begin = time.perf_counter()
             for rows in parts:
                 # Only the risky samples are worth up to `steps` evaluations.
-                if len(rows) < len(before):
+                if isinstance(rows, Tensor):
                     risk, _ = self._look(inputs[rows])
                 result = project(risk, action[rows], self.limit, **self.settings)
                 executed[rows], after[rows] = result.action, result.risk_after
