@@ -6,24 +6,18 @@ import functools
 
 import pytest
 import torch
-from tensordict import TensorDict
+from echo import EchoEnv
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.data import (
-    Binary,
-    Bounded,
-    Composite,
     LazyTensorStorage,
     ReplayBuffer,
     TensorDictReplayBuffer,
-    Unbounded,
 )
-from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, Transform, TransformedEnv
+from torchrl.envs import ParallelEnv, SerialEnv, Transform, TransformedEnv
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 from saferl.envs.transforms import ExecutedAction, SafetyProjector
-from saferl.envs.transforms import projector as transform
-from saferl.modules import CriticEnsemble, MLPValue, MMAMValue, projection, value_operator
 
 LIMIT = 0.2
 REPORT = {
@@ -34,54 +28,6 @@ REPORT = {
     "intervened",
     "feasible",
 }
-
-
-class EchoEnv(EnvBase):
-    """Writes the action it executed into `felt`; each episode takes `horizon` + its index steps."""
-
-    def __init__(self, batch_size=(), horizon=3):
-        super().__init__(batch_size=batch_size)
-        batch = self.batch_size
-        self.horizon = horizon + torch.arange(batch.numel()).reshape(*batch, 1)
-        self.observation_spec = Composite(
-            observation=Unbounded((*batch, 2)),
-            felt=Unbounded((*batch, 2)),
-            time=Unbounded((*batch, 1), dtype=torch.int64),
-            shape=batch,
-        )
-        self.action_spec = Bounded(-1.0, 1.0, (*batch, 2))
-        self.reward_spec = Unbounded((*batch, 1))
-        self.done_spec = Composite(
-            {
-                key: Binary(1, (*batch, 1), dtype=torch.bool)
-                for key in ("done", "terminated", "truncated")
-            },
-            shape=batch,
-        )
-        self.generator = torch.Generator().manual_seed(0)
-
-    def _reset(self, tensordict=None, **kwargs):
-        observation = torch.rand(*self.batch_size, 2, generator=self.generator)
-        felt, time = torch.zeros_like(observation), torch.zeros(*self.batch_size, 1).long()
-        return TensorDict(observation=observation, felt=felt, time=time, batch_size=self.batch_size)
-
-    def _step(self, tensordict):
-        action = tensordict["action"]
-        time = tensordict["time"] + 1
-        over = time >= self.horizon
-        return TensorDict(
-            observation=torch.rand(*self.batch_size, 2, generator=self.generator),
-            felt=action.clone(),
-            time=time,
-            reward=action.sum(-1, keepdim=True),
-            done=over,
-            terminated=torch.zeros_like(over),
-            truncated=over.clone(),
-            batch_size=self.batch_size,
-        )
-
-    def _set_seed(self, seed):
-        self.generator.manual_seed(seed)
 
 
 def risk_of(observation, action):
@@ -278,83 +224,6 @@ def test_what_never_gets_feasible(keep):
     check(data, feasible=False)
     assert (~data["next", "feasible"]).any()
     assert (data["next", "projection_steps"] <= 2).all()
-
-
-def test_reads_the_live_critic():
-    """An ensemble's change is felt at the next step; its parameters stay without gradient."""
-    torch.manual_seed(0)
-    critics = [
-        value_operator(
-            MLPValue(2, 8, ego_scale=[1.0] * 2, vehicle_scale=[1.0] * 2),
-            in_keys=["ego", "vehicles", "action"],
-            out_key="state_action_cost_value",
-        )
-        for _ in range(2)
-    ]
-    ensemble = CriticEnsemble(critics)
-    view = CriticEnsemble(critics[0], ensemble.params)
-
-    class Scene(Transform):
-        """The toy observation under the names and shapes of the driving environment."""
-
-        def _call(self, next_tensordict):
-            observation = next_tensordict["observation"]
-            rows = observation.unsqueeze(-2).expand(*observation.shape[:-1], 2, 2).clone()
-            return next_tensordict.update({"ego": observation.clone(), "vehicles": rows})
-
-        def _reset(self, tensordict, tensordict_reset):
-            return self._call(tensordict_reset)
-
-        def transform_observation_spec(self, observation_spec):
-            batch = observation_spec.shape
-            observation_spec["ego"] = Unbounded((*batch, 2))
-            observation_spec["vehicles"] = Unbounded((*batch, 2, 2))
-            return observation_spec
-
-    env = TransformedEnv(EchoEnv((6,)), Scene())
-    env.append_transform(SafetyProjector(view, limit=-1e9, penalty=1e3, keep="safest"))
-    check_env_specs(env)
-    assert not list(env.transform.parameters())
-    for _ in range(2):
-        data = env.rollout(2)
-        expected = ensemble(data.copy())["state_action_cost_value"]
-        torch.testing.assert_close(data["next", "risk_before"], expected)
-        executed = data.copy().set("action", data["next", "action_executed"])
-        after = ensemble(executed)["state_action_cost_value"]
-        torch.testing.assert_close(data["next", "risk_after"], after)
-        assert (after <= expected).all() and (after < expected).any()
-        assert all(p.grad is None for p in ensemble.parameters())
-        with torch.no_grad():
-            for p in ensemble.parameters():
-                p.add_(0.3 * torch.randn_like(p))
-
-
-@pytest.mark.parametrize(
-    "backend",
-    # The capture alone takes seconds; generating code takes up to a minute.
-    ["eager", pytest.param("inductor", marks=pytest.mark.slow)],
-)
-@pytest.mark.parametrize("batch", [1, 8, 40])
-def test_compiled_in_parts(monkeypatch, request, backend, batch):
-    """More states than one part holds, some of them safe, corrected as without compiling."""
-    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
-    for once in (projection._compiled, transform._compiled_risk):
-        once.cache_clear()
-        request.addfinalizer(once.cache_clear)
-    torch.manual_seed(0)
-    ensemble = CriticEnsemble([value_operator(MMAMValue(16), out_key="risk") for _ in range(2)])
-    states = TensorDict(
-        ego=torch.randn(batch, 9), vehicles=torch.ones(batch, 3, 6), batch_size=batch
-    )
-    states["action"] = torch.rand(batch, 2) * 2 - 1
-    limit = ensemble(states.copy())["risk"].mean().item() - (batch == 1)
-    forms = [SafetyProjector(ensemble, limit, penalty=10.0, compile=c) for c in (False, True)]
-    plain, compiled = (form._inv_call(states.copy())["_safety_projection"] for form in forms)
-    changed = int(plain["intervened"].sum())
-    assert changed == 1 if batch == 1 else batch / 4 < changed < batch
-    for key, value in plain.items():
-        torch.testing.assert_close(compiled[key], value, rtol=0, atol=1e-5)
-    assert [len(form.latencies) for form in forms] == [1, 1]
 
 
 def test_settings_are_checked_at_once():
