@@ -28,6 +28,9 @@ def launch(command: str, config: str) -> None:
     Exits with 0, with 1 after one line about a mistake, or with 130 after Ctrl-C.
     ``HYDRA_FULL_ERROR=1`` shows the trace instead of the line.
     """
+    # Threads of GNU's OpenMP that wait awake without end take the cores from another run's.
+    if "OMP_WAIT_POLICY" not in os.environ:
+        os.environ.setdefault("GOMP_SPINCOUNT", "1000")
     before = os.environ.get("HYDRA_FULL_ERROR")
     # Hydra prints its own exceptions over many lines unless it is told to let them pass.
     os.environ["HYDRA_FULL_ERROR"] = "1"

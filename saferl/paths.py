@@ -1,7 +1,11 @@
-"""Where the configuration files and the policies that ship with saferl lie."""
+"""Where the configuration files and the policies that ship with saferl lie, and what conf can ask."""
 
 from __future__ import annotations
 
+import os
+import shutil
+import sys
+import sysconfig
 from pathlib import Path
 
 from omegaconf import OmegaConf
@@ -16,6 +20,27 @@ OmegaConf.register_new_resolver(
 )
 
 PACKAGE = Path(__file__).resolve().parent
+#: A budget for which compiling pays, which takes minutes.
+LONG = {"episodes": 2_000, "frames": 100_000}
+
+
+def pays_to_compile(episodes: int | None, frames: int | None) -> bool:
+    """Whether a budget is long and torch finds what it compiles with: a C++ compiler, Python's headers.
+
+    >>> pays_to_compile(episodes=10, frames=None)
+    False
+    """
+    usual = {"darwin": "clang++", "win32": "cl"}.get(sys.platform, "g++")
+    able = shutil.which(os.environ.get("CXX", usual)) and (
+        Path(sysconfig.get_path("include")) / "Python.h"
+    ).is_file()
+    budget = {"episodes": episodes, "frames": frames}
+    long = any(isinstance(n, int) and n >= LONG[kind] for kind, n in budget.items())
+    return bool(able and long)
+
+
+# ${pays_to_compile:${episodes},${frames}}
+OmegaConf.register_new_resolver("pays_to_compile", pays_to_compile, replace=True)
 
 
 def config_dir() -> str:

@@ -20,6 +20,9 @@ SMALL = (
     "evaluation.episodes=1",
     "logger=none",
     "device=cpu",
+    "threads=1",
+    "env.num_envs=2",
+    "compile=false",
 )
 EMPTY = ("env=batched", "env.num_envs=2", "task.vehicles=0")
 

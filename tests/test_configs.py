@@ -111,7 +111,7 @@ def test_cost_limit_sets_the_episode_budget_of_sac_lag(options, limit: float):
 @pytest.mark.parametrize("option", [o for o in OPTIONS if o.startswith("experiment=")])
 @pytest.mark.parametrize("algo", ["arsac", "sac"])
 def test_preset_builds_with_either_kind_of_algorithm(option: str, algo: str, tmp_path: Path):
-    fast = ("encoder.policy.width=16", "logger=none", "compile=false", "env.compile_physics=false")
+    fast = ("encoder.policy.width=16", "logger=none", "compile=false", "threads=1")
     cfg = compose(option, f"algo={algo}", *fast)
     build_trainer(cfg, tmp_path)
 
