@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -289,7 +290,10 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         build_optimizer(cfg, agent.loss),
         SoftUpdate(agent.loss, tau=cfg.tau),
         order=cfg.get("update_order", "joint"),  # a run from before this setting has none
-        compile=compiled if cfg.compile else None,
+        # A GPU would wait for Python between the many small kernels of a loss: CUDA graphs.
+        compile=partial(compiled, mode="reduce-overhead" if device.type == "cuda" else None)
+        if cfg.compile
+        else None,
     )
     trainer = Trainer(
         run=run,
