@@ -33,11 +33,9 @@ from straight import StraightSACLag
 from tensordict import TensorDict
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
-from torchrl.objectives import SoftUpdate
 
-from saferl.builders import build_agent, build_optimizer
+from saferl.builders import build_agent, build_learner
 from saferl.learner import Learner
-from saferl.modules import compiled
 from saferl.paths import config_dir
 
 ROWS = 11
@@ -97,13 +95,9 @@ def transitions(batch: int, device: str) -> TensorDict:
 
 def learner(overrides: list[str], device: str, compile: bool) -> Learner:
     with initialize_config_dir(config_dir(), version_base=None):
-        cfg = compose("config", [*overrides, f"device={device}"])
+        cfg = compose("config", [*overrides, f"device={device}", f"compile={compile}"])
     torch.manual_seed(0)
-    loss = build_agent(cfg).loss
-    optimizer = build_optimizer(cfg, loss)
-    return Learner(
-        loss, optimizer, SoftUpdate(loss, tau=cfg.tau), compile=compiled if compile else None
-    )
+    return build_learner(cfg, build_agent(cfg).loss)
 
 
 def main() -> None:

@@ -231,6 +231,19 @@ def build_optimizer(cfg: DictConfig, loss: LossModule) -> torch.optim.Optimizer:
     )
 
 
+def build_learner(cfg: DictConfig, loss: LossModule) -> Learner:
+    """What makes an update of a loss: optimizer, targets, order, and whether it is compiled."""
+    # A GPU would wait for Python between the many small kernels of a loss: CUDA graphs.
+    mode = "reduce-overhead" if device_of(cfg).type == "cuda" else None
+    return Learner(
+        loss,
+        build_optimizer(cfg, loss),
+        SoftUpdate(loss, tau=cfg.tau),
+        order=cfg.get("update_order", "joint"),  # a run from before this setting has none
+        compile=partial(compiled, mode=mode) if cfg.compile else None,
+    )
+
+
 def build_loggers(cfg: DictConfig, run: Path) -> list:
     """TorchRL loggers that write into the run's folder.
 
@@ -285,21 +298,11 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
     buffer.append_transform(RewardScaling(0.0, cfg.reward_scale, in_keys=[("next", "reward")]))
     if agent.projector is not None:
         buffer.append_transform(ExecutedAction())
-    learner = Learner(
-        agent.loss,
-        build_optimizer(cfg, agent.loss),
-        SoftUpdate(agent.loss, tau=cfg.tau),
-        order=cfg.get("update_order", "joint"),  # a run from before this setting has none
-        # A GPU would wait for Python between the many small kernels of a loss: CUDA graphs.
-        compile=partial(compiled, mode="reduce-overhead" if device.type == "cuda" else None)
-        if cfg.compile
-        else None,
-    )
     trainer = Trainer(
         run=run,
         collector=collector,
         buffer=buffer,
-        learner=learner,
+        learner=build_learner(cfg, agent.loss),
         budget=budget,
         stored=STORED,
         updates_per_frame=cfg.updates_per_frame,

@@ -31,9 +31,10 @@ def pays_to_compile(episodes: int | None, frames: int | None) -> bool:
     False
     """
     usual = {"darwin": "clang++", "win32": "cl"}.get(sys.platform, "g++")
-    able = shutil.which(os.environ.get("CXX", usual)) and (
-        Path(sysconfig.get_path("include")) / "Python.h"
-    ).is_file()
+    able = (
+        shutil.which(os.environ.get("CXX", usual))
+        and (Path(sysconfig.get_path("include")) / "Python.h").is_file()
+    )
     budget = {"episodes": episodes, "frames": frames}
     long = any(isinstance(n, int) and n >= LONG[kind] for kind, n in budget.items())
     return bool(able and long)
