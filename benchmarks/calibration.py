@@ -19,7 +19,7 @@ import torch
 from saferl.builders import load_agent
 from saferl.checkpoint import run_config
 from saferl.envs.intersection import BatchedIntersection
-from saferl.envs.intersection.spawning import episode_seeds
+from saferl.envs.seeding import episode_seeds
 from saferl.evaluation import as_test, play
 
 

@@ -19,11 +19,7 @@ from torchrl.envs.utils import check_env_specs
 from saferl.envs.intersection import BatchedIntersection, Scenario
 from saferl.envs.intersection.base import OUTCOMES
 from saferl.envs.intersection.batched import vehicles_of
-from saferl.envs.intersection.spawning import (
-    episode_seeds,
-    mix,
-    uniform,
-)
+from saferl.envs.seeding import episode_seeds, mix, uniform
 
 # --- specs ---------------------------------------------------------------------------------------
 

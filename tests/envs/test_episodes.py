@@ -20,8 +20,8 @@ from saferl.envs.intersection.geometry import ROUTES, ROUTES_OF_TASK, project, r
 from saferl.envs.intersection.spawning import (
     draw_route,
     draw_start,
-    episode_seeds,
 )
+from saferl.envs.seeding import episode_seeds
 
 # --- starts --------------------------------------------------------------------------------------
 

@@ -23,9 +23,10 @@ from saferl.envs.intersection.geometry import ARM, LENGTH, WIDTH, frame, overlap
 from saferl.envs.intersection.network import build_network, routes
 from saferl.envs.intersection.regulation import IntersectionRoad
 from saferl.envs.intersection.roads import lane_frames, lane_project, lanes, pairs, zones
-from saferl.envs.intersection.spawning import Drawn, draw_traffic, episode_seeds
+from saferl.envs.intersection.spawning import Drawn, draw_traffic
 from saferl.envs.intersection.traffic import Vehicles, accelerate, road_rules, vehicle_states
 from saferl.envs.intersection.vehicles import EgoVehicle, RouteVehicle
+from saferl.envs.seeding import episode_seeds
 
 F64 = torch.float64
 

@@ -20,8 +20,9 @@ from saferl.envs.intersection.geometry import (
 )
 from saferl.envs.intersection.network import build_network, rectangles_overlap, routes
 from saferl.envs.intersection.regulation import IntersectionRoad
-from saferl.envs.intersection.spawning import Drawn, Traffic, draw_traffic, episode_seeds
+from saferl.envs.intersection.spawning import Drawn, Traffic, draw_traffic
 from saferl.envs.intersection.vehicles import EgoVehicle
+from saferl.envs.seeding import episode_seeds
 
 DT = 1 / 15
 SOUTH, WEST, NORTH, EAST = 0, 4, 8, 12  # first route of each arm

@@ -14,7 +14,8 @@ from torchrl.envs.utils import check_env_specs
 from saferl.envs.intersection import BatchedIntersection, HighwayIntersection, Reward, Scenario
 from saferl.envs.intersection.base import OUTCOMES
 from saferl.envs.intersection.drivers import Driver
-from saferl.envs.intersection.spawning import draw_route, episode_seeds
+from saferl.envs.intersection.spawning import draw_route
+from saferl.envs.seeding import episode_seeds
 
 OBSERVATION = ("ego", "vehicles", "route", *OUTCOMES)
 RESULT = (*OBSERVATION, "reward", "cost", "terminated", "truncated", "done")

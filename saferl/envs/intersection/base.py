@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
 
 from saferl.envs.intersection.cost import CollisionCost
 from saferl.envs.intersection.geometry import ROUTES, ROUTES_OF_TASK
 from saferl.envs.intersection.observation import ROWS
 from saferl.envs.intersection.reward import Reward
-from saferl.envs.intersection.spawning import SCENARIOS, U31, Traffic, mix
+from saferl.envs.intersection.spawning import SCENARIOS, Traffic
 from saferl.envs.intersection.traffic import PERIOD
+from saferl.envs.seeding import SeededEnv
 
 SUBSTEPS = 3
 STANDING = 0.3  # m/s, slower counts as standing still
@@ -141,7 +141,7 @@ class Scenario:
         return 1.0 / (SUBSTEPS * self.policy_frequency)
 
 
-class IntersectionBase(EnvBase):
+class IntersectionBase(SeededEnv):
     """Specs and seeding of the intersection; subclasses drive it.
 
     Reads ``action`` [B, 2] in [-1, 1]: a_x / 5 m/s^2, delta_f / 0.6 rad. Writes ``ego`` [B, 9] and
@@ -153,9 +153,7 @@ class IntersectionBase(EnvBase):
     """
 
     def __init__(self, scenario: Scenario, num_envs: int, seed: int, device=None):
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be >= 1, got {num_envs}.")
-        super().__init__(device=device, batch_size=[num_envs])
+        super().__init__(num_envs, device)
         self.scenario = scenario
         self._make_specs()
         self.set_seed(seed)
@@ -163,7 +161,6 @@ class IntersectionBase(EnvBase):
     def _make_specs(self) -> None:
         batch = self.batch_size
         flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool)
-        scalar = Unbounded(shape=(*batch, 1))
         self.observation_spec = Composite(
             ego=Unbounded(shape=(*batch, 9)),
             vehicles=Unbounded(shape=(*batch, self.scenario.rows, 6)),
@@ -172,31 +169,7 @@ class IntersectionBase(EnvBase):
             shape=batch,
         )
         self.action_spec = Bounded(-1.0, 1.0, shape=(*batch, 2))
-        self.reward_spec = Composite(reward=scalar.clone(), cost=scalar.clone(), shape=batch)
-        self.full_done_spec = Composite(
-            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=batch
-        )
-        self.to(self.device) if self.device is not None else None
-
-    def _set_seed(self, seed: int | None) -> None:
-        index = torch.arange(self.batch_size[0], dtype=torch.int64, device=self.device)
-        self._stream = mix(mix(torch.full_like(index, int(seed or 0)), 0) + index, 0)
-        self._episode = torch.zeros_like(self._stream)
-
-    def _next_seeds(self, tensordict: TensorDictBase | None, reset: Tensor) -> Tensor:
-        """Episode seeds [B] (31 bits) for the environments in ``reset`` [B]; advances those alone."""
-        given = None if tensordict is None else tensordict.get("seed", None)
-        if given is not None:
-            return given.reshape(self.batch_size).to(torch.int64)
-        seeds = mix(self._stream, self._episode) & U31
-        self._episode = self._episode + reset
-        return seeds
-
-    def _reset_mask(self, tensordict: TensorDictBase | None) -> Tensor:
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        if mask is None:
-            return torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
-        return mask.reshape(self.batch_size)
+        self._make_ends()
 
     def _output(self, values: dict[str, Tensor]) -> TensorDict:
         """Shape [B] tensors to the specs' [B, 1]."""

@@ -15,8 +15,8 @@ from saferl.envs.intersection.geometry import (
     reference_lines,
     wrap,
 )
-from saferl.envs.intersection.spawning import mix, uniform
 from saferl.envs.intersection.traffic import STOP
+from saferl.envs.seeding import mix, uniform
 
 CRUISE = 9.0  # m/s
 _LATERAL = 4.5  # m/s^2, the most that a driver asks of a bend

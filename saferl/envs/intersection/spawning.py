@@ -24,9 +24,8 @@ from saferl.envs.intersection.geometry import (
     reference_lines,
 )
 from saferl.envs.intersection.roads import lane_frames, lanes
+from saferl.envs.seeding import mix, uniform
 
-_MIX = (-7046029254386353131, -4658895280553007687, -7723592293110705685)
-U31 = 0x7FFFFFFF
 _VEHICLES, _ENTRIES, _NOISE = 64, 1_000, 1_000_000  # streams of an episode's seed
 
 #: Weight of each route when a surrounding vehicle is drawn, [ego's route][arm][left, straight
@@ -111,35 +110,10 @@ SCENARIOS = {
 }
 
 
-def _shift(x: Tensor, bits: int) -> Tensor:
-    return (x >> bits) & ((1 << (64 - bits)) - 1)
-
-
-def mix(seed: Tensor, stream: int | Tensor) -> Tensor:
-    """Hash int64 seeds [...] and a stream number into new int64 seeds (SplitMix64's finaliser).
-
-    A draw is a function of its seed alone, so an episode does not feel its neighbours.
-    """
-    x = seed + torch.as_tensor(stream + 1, device=seed.device) * _MIX[0]
-    x = (x ^ _shift(x, 30)) * _MIX[1]
-    x = (x ^ _shift(x, 27)) * _MIX[2]
-    return x ^ _shift(x, 31)
-
-
-def uniform(seed: Tensor, stream: int) -> Tensor:
-    """A number in [0, 1), float64 [...], from int64 seeds [...] and a stream number."""
-    return _shift(mix(seed, stream), 11).to(torch.float64) * 2.0**-53
-
-
 def between(pair: tuple[float, float], seed: Tensor, stream: int) -> Tensor:
     """A number in [low, high), float64 [...]."""
     low, high = pair
     return low + (high - low) * uniform(seed, stream)
-
-
-def episode_seeds(seed: int, count: int) -> Tensor:
-    """Seeds [count] of the episodes of a test with this seed."""
-    return mix(torch.arange(count, dtype=torch.int64), seed) & U31
 
 
 def draw_route(task: str, seed: Tensor) -> Tensor:
@@ -220,6 +194,7 @@ def draw_traffic(traffic: Traffic, ego_route: Tensor, ego: Tensor, seed: Tensor)
         ego: start states [..., 6].
         seed: int64 [...].
 
+    >>> from saferl.envs.seeding import episode_seeds
     >>> seed = episode_seeds(0, 3)
     >>> route = draw_route("gs", seed)
     >>> draw_traffic(Traffic(), route, draw_start(route, seed, 0.0), seed).s.shape

@@ -1,0 +1,91 @@
+"""Random numbers as functions of a seed, and environments whose episodes are.
+
+No generator is shared: what happens in an episode follows from its own 31-bit seed, whoever plays beside it.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+_MIX = (-7046029254386353131, -4658895280553007687, -7723592293110705685)
+U31 = 0x7FFFFFFF
+
+
+def _shift(x: Tensor, bits: int) -> Tensor:
+    return (x >> bits) & ((1 << (64 - bits)) - 1)
+
+
+def mix(seed: Tensor, stream: int | Tensor) -> Tensor:
+    """Hash int64 seeds [...] and a stream number into new int64 seeds (SplitMix64's finaliser).
+
+    A draw is a function of its seed alone, so an episode does not feel its neighbours.
+    """
+    x = seed + torch.as_tensor(stream + 1, device=seed.device) * _MIX[0]
+    x = (x ^ _shift(x, 30)) * _MIX[1]
+    x = (x ^ _shift(x, 27)) * _MIX[2]
+    return x ^ _shift(x, 31)
+
+
+def uniform(seed: Tensor, stream: int) -> Tensor:
+    """A number in [0, 1), float64 [...], from int64 seeds [...] and a stream number."""
+    return _shift(mix(seed, stream), 11).to(torch.float64) * 2.0**-53
+
+
+def episode_seeds(seed: int, count: int) -> Tensor:
+    """Seeds [count] of the episodes of a test with this seed."""
+    return mix(torch.arange(count, dtype=torch.int64), seed) & U31
+
+
+class SeededEnv(EnvBase):
+    """A batch of environments, each with its own sequence of seeded episodes; ``reward`` and ``cost`` [B, 1].
+
+    A reset may be told which episodes to play by an int64 key ``seed`` [B] or [B, 1]; without it every
+    environment goes on in its own sequence, which follows from ``set_seed``.
+
+    Args:
+        num_envs: B.
+        device: of the tensors.
+
+    Raises:
+        ValueError: ``num_envs`` is less than one.
+    """
+
+    def __init__(self, num_envs: int, device=None):
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be >= 1, got {num_envs}.")
+        super().__init__(device=device, batch_size=[num_envs])  # pyright: ignore[reportArgumentType]
+
+    def _make_ends(self) -> None:
+        """The specs of reward, cost and the ends of episodes."""
+        batch = self.batch_size
+        flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool)  # pyright: ignore
+        scalar = Unbounded(shape=(*batch, 1))  # pyright: ignore[reportArgumentType]
+        self.reward_spec = Composite(reward=scalar.clone(), cost=scalar.clone(), shape=batch)
+        self.full_done_spec = Composite(
+            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=batch
+        )
+        self.to(self.device) if self.device is not None else None
+
+    def _set_seed(self, seed: int | None) -> None:
+        index = torch.arange(self.batch_size[0], dtype=torch.int64, device=self.device)
+        self._stream = mix(mix(torch.full_like(index, int(seed or 0)), 0) + index, 0)
+        self._episode = torch.zeros_like(self._stream)
+
+    def _next_seeds(self, tensordict: TensorDictBase | None, reset: Tensor) -> Tensor:
+        """Episode seeds [B] (31 bits) for the environments in ``reset`` [B]; advances those alone."""
+        given = None if tensordict is None else tensordict.get("seed", None)
+        if given is not None:
+            return given.reshape(self.batch_size).to(torch.int64)
+        seeds = mix(self._stream, self._episode) & U31
+        self._episode = self._episode + reset
+        return seeds
+
+    def _reset_mask(self, tensordict: TensorDictBase | None) -> Tensor:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None:
+            return torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
+        return mask.reshape(self.batch_size)
