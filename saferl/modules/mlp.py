@@ -35,6 +35,32 @@ class _FlatScene(nn.Module):
         return torch.cat([ego / self.ego_scale, features.flatten(-2)], dim=-1)
 
 
+class _Vector(nn.Module):
+    """A plain observation as it is."""
+
+    def __init__(self, size: int):
+        super().__init__()
+        self.size = size
+
+    def forward(self, observation: Tensor) -> Tensor:
+        if observation.shape[-1] != self.size:
+            raise ValueError(
+                f"observation must have size={self.size}, got {observation.shape[-1]}."
+            )
+        return observation
+
+
+def _front(
+    size: int | None, rows: int | None, ego_scale: Sequence[float], vehicle_scale: Sequence[float]
+) -> _FlatScene | _Vector:
+    """What an MLP's first layer sees."""
+    if size is not None:
+        return _Vector(size)
+    if rows is None:
+        raise ValueError("An MLP needs rows, of the vehicles, or size, of a plain observation.")
+    return _FlatScene(rows, ego_scale, vehicle_scale)
+
+
 def _hidden(size: int, width: int, depth: int, activation: type[nn.Module]) -> nn.Sequential:
     layers: list[nn.Module] = []
     for _ in range(depth):
@@ -53,6 +79,7 @@ class MLPPolicyEncoder(nn.Module):
         activation: the module class of the activation, one without parameters.
         ego_scale: divisors of the ego features.
         vehicle_scale: divisors of a vehicle's features; I_veh comes first.
+        size: of a plain ``observation`` [*B, size] that takes the place of ego and vehicles; None: these.
 
     Reads ``ego`` [*B, 9] and ``vehicles`` [*B, M, 6], SI units; returns features [*B, width].
 
@@ -69,21 +96,23 @@ class MLPPolicyEncoder(nn.Module):
 
     def __init__(
         self,
-        rows: int = 11,
+        rows: int | None = 11,
         width: int = 256,
         depth: int = 3,
         activation: type[nn.Module] = nn.GELU,
         ego_scale: Sequence[float] = EGO_SCALE,
         vehicle_scale: Sequence[float] = VEHICLE_SCALE,
+        size: int | None = None,
     ):
         super().__init__()
         if depth < 1:
             raise ValueError(f"depth must be >= 1, got {depth}.")
-        self.scene = _FlatScene(rows, ego_scale, vehicle_scale)
+        self.scene = _front(size, rows, ego_scale, vehicle_scale)
+        self.in_keys = ("ego", "vehicles") if size is None else ("observation",)
         self.layers = _hidden(self.scene.size, width, depth, activation)
 
-    def forward(self, ego: Tensor, vehicles: Tensor) -> Tensor:
-        return self.layers(self.scene(ego, vehicles))
+    def forward(self, *observed: Tensor) -> Tensor:
+        return self.layers(self.scene(*observed))
 
 
 class MLPValue(nn.Module):
@@ -97,9 +126,12 @@ class MLPValue(nn.Module):
         activation: the module class of the activation, one without parameters.
         ego_scale: divisors of the ego features.
         vehicle_scale: divisors of a vehicle's features; I_veh comes first.
+        size: of a plain ``observation`` [*B, size] that takes the place of ego and vehicles; None: these.
+        outputs: K, more than one for the quantiles of a distributional critic.
+        layer_norm: normalise each hidden layer before its activation, without gain or bias.
 
     Reads ``ego`` [*B, 9], ``vehicles`` [*B, M, 6] (SI units) and ``action`` [*B, 2] in [-1, 1];
-    returns values [*B, 1].
+    returns values [*B, K].
 
     Raises:
         ValueError: as :class:`MLPPolicyEncoder`.
@@ -114,38 +146,51 @@ class MLPValue(nn.Module):
 
     def __init__(
         self,
-        rows: int = 11,
+        rows: int | None = 11,
         width: int = 256,
         depth: int = 3,
         action_dim: int = 2,
         activation: type[nn.Module] = nn.GELU,
         ego_scale: Sequence[float] = EGO_SCALE,
         vehicle_scale: Sequence[float] = VEHICLE_SCALE,
+        size: int | None = None,
+        outputs: int = 1,
+        layer_norm: bool = False,
     ):
         super().__init__()
         if depth < 1:
             raise ValueError(f"depth must be >= 1, got {depth}.")
-        self.scene = _FlatScene(rows, ego_scale, vehicle_scale)
+        self.scene = _front(size, rows, ego_scale, vehicle_scale)
+        self.in_keys = ("ego", "vehicles") if size is None else ("observation",)
         self.first = nn.Linear(self.scene.size + action_dim, width)
         self.activation = activation()
-        sizes = [width] * (depth - 1) + [1]
+        sizes = [width] * (depth - 1) + [outputs]
         self.layers = nn.ModuleList(nn.Linear(width, size) for size in sizes)
+        self.layer_norm = layer_norm
 
-    def encode(self, ego: Tensor, vehicles: Tensor) -> dict[str, Any]:
+    @property
+    def readouts(self) -> list[nn.Linear]:
+        """The last layer."""
+        return [self.layers[-1]]  # pyright: ignore[reportReturnType]
+
+    def encode(self, *observed: Tensor) -> dict[str, Any]:
         """All that :meth:`value` needs: the first layer's sum over the scene, and the weights."""
         on_scene, on_action = self.first.weight.tensor_split([self.scene.size], dim=-1)
         return {
-            "first": F.linear(self.scene(ego, vehicles), on_scene, self.first.bias),
+            "first": F.linear(self.scene(*observed), on_scene, self.first.bias),
             "on_action": on_action,
             "layers": [[layer.weight, layer.bias] for layer in self.layers],
         }
 
     def value(self, scene: dict[str, Any], action: Tensor) -> Tensor:
-        """The value of ``action`` [*B, A] in the states of ``scene``, [*B, 1]."""
+        """The value of ``action`` [*B, A] in the states of ``scene``, [*B, K]."""
         hidden = scene["first"] + F.linear(action, scene["on_action"])
         for weight, bias in scene["layers"]:
+            if self.layer_norm:
+                hidden = F.layer_norm(hidden, hidden.shape[-1:])
             hidden = F.linear(self.activation(hidden), weight, bias)
         return hidden
 
-    def forward(self, ego: Tensor, vehicles: Tensor, action: Tensor) -> Tensor:
-        return self.value(self.encode(ego, vehicles), action)
+    def forward(self, *inputs: Tensor) -> Tensor:
+        *observed, action = inputs
+        return self.value(self.encode(*observed), action)

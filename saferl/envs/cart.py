@@ -1,0 +1,168 @@
+# TorchRL's specs take tuples that their annotations do not name.
+# pyright: reportArgumentType=false
+"""A small constrained control task whose optimum is known: a cart under a budget of effort."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.linalg import solve_discrete_are
+from scipy.optimize import brentq
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Composite, Unbounded
+
+from saferl.envs.seeding import SeededEnv, uniform
+
+_A = np.array([[0.8, 0.3], [0.0, 0.8]])
+_B = np.array([[0.0], [0.5]])
+_Q = np.diag([1.0, 0.1])
+
+
+@dataclass(frozen=True)
+class Cart:
+    """A cart that a bounded force brings to the middle: a constrained linear-quadratic problem.
+
+    With x = [position, velocity] and u the action: x' = A x + B u + w, reward -x Q x, cost u^2.
+    A = [[0.8, 0.3], [0, 0.8]], B = [0, 0.5], Q = diag(1, 0.1). Starts are uniform in [-spread, spread]^2, w is
+    uniform in [-noise, noise] on the velocity. An episode is truncated, never terminated.
+
+    Attributes:
+        horizon: decisions of an episode.
+        spread, noise: see above.
+        size, action_dim, task: of the observation, of the action, and what runs are called.
+    """
+
+    horizon: int = 20
+    spread: float = 1.0
+    noise: float = 0.1
+    size: int = 2
+    action_dim: int = 1
+    task: str = "cart"
+
+    def sums(
+        self, gain: np.ndarray, gamma: float, horizon: float = math.inf
+    ) -> tuple[float, float]:
+        """Expected discounted reward and cost of the policy u = -gain x, which must not reach the box.
+
+        Args:
+            gain: [2].
+            gamma: discount; 1 with a finite horizon is a sum.
+            horizon: decisions.
+        """
+        closed = _A - _B @ gain[None]
+        moment = np.eye(2) * self.spread**2 / 3
+        shock = np.diag([0.0, self.noise**2 / 3])
+        reward = cost = 0.0
+        weight, steps = 1.0, min(horizon, math.ceil(40 / max(1 - gamma, 1e-9)))
+        for _ in range(int(steps)):
+            reward -= weight * float(np.trace(_Q @ moment))
+            cost += weight * float(gain @ moment @ gain)
+            moment, weight = closed @ moment @ closed.T + shock, weight * gamma
+        return reward, cost
+
+    def gain(self, multiplier: float, gamma: float) -> np.ndarray:
+        """The policy [2] that is best for reward - multiplier * cost, discounted for ever (Riccati)."""
+        root = gamma**0.5
+        value = solve_discrete_are(root * _A, root * _B, _Q, np.array([[multiplier]]))
+        inner = multiplier + gamma * _B.T @ value @ _B
+        return (gamma * np.linalg.solve(inner, _B.T @ value @ _A))[0]
+
+    def optimum(
+        self, limit: float, gamma: float, cost_gamma: float | None = None, horizon: float = math.inf
+    ) -> np.ndarray:
+        """The best policy [2] whose cost is at most ``limit``.
+
+        Args:
+            limit: on the expected sum of costs.
+            gamma: discount of the reward, and of the cost in what a multiplier trades.
+            cost_gamma: discount of the cost in the limit; as ``gamma`` by default.
+            horizon: decisions of the sum that is limited.
+
+        Raises:
+            ValueError: the limit does not bind.
+        """
+        cost_gamma = gamma if cost_gamma is None else cost_gamma
+
+        def excess(log_multiplier: float) -> float:
+            gain = self.gain(math.exp(log_multiplier), gamma)
+            return self.sums(gain, cost_gamma, horizon)[1] - limit
+
+        if excess(-9.0) < 0:
+            raise ValueError(f"limit={limit} does not bind: the best policy costs less.")
+        return self.gain(math.exp(brentq(excess, -9.0, 12.0)), gamma)  # pyright: ignore
+
+
+class CartEnv(SeededEnv):
+    """:class:`Cart` as a batch of tensors.
+
+    Args:
+        scenario: the task.
+        num_envs: B.
+        seed: of the sequences of episodes.
+        device: of the tensors.
+
+    Reads ``action`` [B, 1] in [-1, 1]. Writes ``observation`` [B, 2], ``reward`` and ``cost`` [B, 1].
+
+    >>> CartEnv(Cart(), num_envs=3).rollout(2)["next", "cost"].shape
+    torch.Size([3, 2, 1])
+    """
+
+    def __init__(self, scenario: Cart, num_envs: int = 1, seed: int = 0, device=None):
+        super().__init__(num_envs, device)
+        self.scenario = scenario
+        batch = self.batch_size
+        self.observation_spec = Composite(observation=Unbounded(shape=(*batch, 2)), shape=batch)
+        self.action_spec = Bounded(-1.0, 1.0, shape=(*batch, 1))
+        self._make_ends()
+        self._state = torch.zeros(*batch, 2, device=self.device)
+        self._seeds = torch.zeros(batch, dtype=torch.int64, device=self.device)
+        self._steps = torch.zeros_like(self._seeds)
+        self._matrices = [
+            torch.tensor(m, dtype=torch.float32, device=self.device) for m in (_A, _B)
+        ]
+        self.set_seed(seed)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+        reset = self._reset_mask(tensordict)
+        self._seeds = torch.where(reset, self._next_seeds(tensordict, reset), self._seeds)
+        self._steps = torch.where(reset, 0, self._steps)
+        drawn = torch.stack([uniform(self._seeds, stream) for stream in (0, 1)], -1)
+        start = ((2 * drawn - 1) * self.scenario.spread).to(self._state)
+        self._state = torch.where(reset[:, None], start, self._state)
+        return TensorDict(
+            {"observation": self._state.clone()}, batch_size=self.batch_size, device=self.device
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict.get("action").clamp(-1.0, 1.0)
+        state, (A, B) = self._state, self._matrices
+        reward = -(state.square() @ state.new_tensor(np.diag(_Q)).unsqueeze(-1))
+        shock = (2 * uniform(self._seeds + (self._steps << 32), 2) - 1) * self.scenario.noise
+        self._state = state @ A.T + action @ B.T
+        self._state[:, 1] += shock.to(state)
+        self._steps = self._steps + 1
+        done = (self._steps >= self.scenario.horizon)[:, None]
+        return TensorDict(
+            {
+                "observation": self._state.clone(),
+                "reward": reward,
+                "cost": action.square(),
+                "terminated": torch.zeros_like(done),
+                "truncated": done,
+                "done": done.clone(),
+            },
+            batch_size=self.batch_size,
+            device=self.device,
+        )
+
+    def state_dict(self, *args, **kwargs) -> dict[str, Tensor]:
+        names = ("_stream", "_episode", "_seeds", "_steps", "_state")
+        return {name.lstrip("_"): getattr(self, name) for name in names}
+
+    def load_state_dict(self, state_dict: dict[str, Tensor], *args, **kwargs) -> None:
+        for name, value in state_dict.items():
+            setattr(self, f"_{name}", value.to(self.device or "cpu").clone())

@@ -1,0 +1,84 @@
+"""Any gymnasium environment: costs, boxes, ends, seeds, state."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+from walk import constant
+
+from saferl.envs import GymEnvs, GymTask
+
+
+def test_specs_costs_and_ends():
+    env = GymEnvs(GymTask("test/Walk-v0"), num_envs=3, seed=4)
+    check_env_specs(env)
+    data = env.rollout(7, constant(1.0), break_when_any_done=False)
+    assert data["observation"].shape == (3, 7, 2)  # a Dict, flattened
+    torch.testing.assert_close(
+        data["next", "cost"], torch.full((3, 7, 1), 4.0)
+    )  # 1 is the upper end of [-2, 4]
+    ends = data["next", "truncated"].squeeze(-1)
+    assert ends.tolist() == [[False] * 4 + [True] + [False] * 2] * 3
+    assert not data["next", "terminated"].any()
+    # The last observation is the episode's own, not the next one's, though the array is reused.
+    place = data["next", "observation"][:, :5, 0]
+    torch.testing.assert_close(place.diff(dim=1), torch.full((3, 4), 4.0))
+    assert data["observation"][:, 5, 1].eq(0).all()
+
+
+def test_a_step_of_six_values_says_its_cost():
+    """As Safety-Gymnasium's, whatever info has."""
+    env = GymEnvs(GymTask("test/Six-v0", horizon=3), num_envs=1)
+    data = env.rollout(9, constant(0.0), break_when_any_done=True)
+    torch.testing.assert_close(data["next", "cost"], torch.full((1, 3, 1), 2.0))
+    assert bool(data["next", "truncated"][0, -1])
+
+
+def test_termination_on_the_last_step_stays_a_termination():
+    """docs/pitfalls.md, 2 and 12."""
+    env = GymEnvs(GymTask("test/Walk-v0", horizon=13, kwargs={"cost": "cost"}), num_envs=1)
+    env.envs[0].unwrapped.place = np.zeros(1, np.float32)
+    data = env.rollout(30, constant(1.0), break_when_any_done=True)
+    assert bool(data["next", "truncated"][0, -1]) and data.shape[1] == 5
+
+
+def test_seeds_decide_episodes_and_state_replays_them():
+    task = GymTask("test/Walk-v0")
+    first, second = (GymEnvs(task, num_envs=2, seed=7) for _ in range(2))
+    start = first.reset()["observation"]
+    assert torch.equal(start, second.reset()["observation"])
+    assert not torch.equal(start[0], start[1])
+    assert not torch.equal(start, first.reset()["observation"])
+    asked = first.reset(second.reset().empty().set("seed", torch.tensor([[5], [5]])))
+    assert torch.equal(asked["observation"][0], asked["observation"][1])
+
+    first.step(constant(0.5)(asked))
+    other = GymEnvs(task, num_envs=2, seed=99)
+    other.reset()
+    other.load_state_dict(first.state_dict())
+    steps = [env._step(constant(0.1)(asked.clone())) for env in (first, other)]
+    assert torch.equal(steps[0]["observation"], steps[1]["observation"])
+
+
+@pytest.mark.parametrize(
+    ("task", "message"),
+    [
+        (GymTask("test/Nowhere-v0"), "task.id: test/Nowhere-v0 cannot be made"),
+        (GymTask("no_such_module:Walk-v0"), "cannot be made: No module named 'no_such_module'"),
+        (GymTask("CartPole-v1"), "must have actions in a bounded box .*Discrete"),
+        (GymTask("test/Six-v0"), "task.horizon must be given: test/Six-v0 has no time limit"),
+    ],
+)
+def test_refuses(task: GymTask, message: str):
+    with pytest.raises(ValueError, match=message):
+        GymEnvs(task, num_envs=1)
+
+
+def test_a_missing_cost_is_named():
+    env = GymEnvs(GymTask("test/Walk-v0", cost_key="collision"), num_envs=1)
+    with pytest.raises(KeyError, match=r"task.cost_key: info has no 'collision', it has \['cost'"):
+        env.rollout(1, constant(0.0))
+    free = GymEnvs(GymTask("test/Walk-v0", cost_key=None), num_envs=1)
+    assert free.rollout(2, constant(1.0))["next", "cost"].eq(0).all()
