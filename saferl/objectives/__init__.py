@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from saferl.objectives.cpo import CPOLoss
+from saferl.objectives.ppo import PPOLagLoss
 from saferl.objectives.sac import SACLagLoss
 
-__all__ = ["SACLagLoss"]
+__all__ = ["CPOLoss", "PPOLagLoss", "SACLagLoss"]

@@ -1,0 +1,135 @@
+"""Proximal policy optimisation under a Lagrangian cost constraint."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
+from tensordict.utils import NestedKey
+from torchrl.objectives import ClipPPOLoss
+
+from saferl.modules import LagrangeMultiplier
+from saferl.objectives.advantages import CostValueLoss
+
+
+@dataclass
+class CostKeys(ClipPPOLoss._AcceptedKeys):
+    """Keys that ``set_keys`` accepts beside those of ClipPPOLoss.
+
+    Attributes:
+        cost: the cost under ``"next"``.
+        state_cost_value: what the cost critic writes.
+        cost_advantage, cost_value_target: written by ``begin``, read by the loss.
+        is_init: whether a transition is an episode's first.
+    """
+
+    cost: NestedKey = "cost"
+    state_cost_value: NestedKey = "state_cost_value"
+    cost_advantage: NestedKey = "cost_advantage"
+    cost_value_target: NestedKey = "cost_value_target"
+    is_init: NestedKey = "is_init"
+
+
+class PPOLagLoss(CostValueLoss, ClipPPOLoss):
+    r"""Clipped PPO with a cost critic and a Lagrange multiplier (Ray et al., 2019).
+
+    .. math::
+
+        A &= (A_r - \lambda A_c) / (1 + \lambda), \quad \hat A = (A - \bar A) / \mathrm{std}(A) \\
+        L_\pi &= -E[\min(\rho \hat A, \mathrm{clip}(\rho, 1 - \epsilon, 1 + \epsilon) \hat A)] \\
+        L_c &= E[\tfrac12 (V_c(s) - G_c)^2]
+
+    with :math:`\rho` the ratio of the new policy's probability to the one that acted. The sum is
+    standardised after the two advantages are weighed, never one of them before, so that the multiplier is
+    in units of reward per cost. The multiplier is moved by the loop, once for each batch of fresh episodes:
+    ``loss.lagrange.update(episode_cost - limit)``.
+
+    Args:
+        actor_network (ProbabilisticTensorDictSequential): the policy.
+        critic_network (TensorDictModule): V(s); writes ``"state_value"``.
+        cost_critic (TensorDictModule): V_c(s); writes ``"state_cost_value"``.
+
+    Keyword Args:
+        lagrange (LagrangeMultiplier): the multiplier, saved with the loss.
+        cost_limit (float, optional): reported beside the cost; the multiplier's signal has its own.
+            Defaults to ``0.05``.
+        **settings: as in :class:`~torchrl.objectives.ClipPPOLoss`. Defaults here: ``entropy_bonus=False``,
+            ``normalize_advantage=True``, ``loss_critic_type="l2"``.
+
+    Reads what :meth:`begin` leaves in a batch, in any batch shape ``[*B]``.
+    Writes ``"loss_objective"``, ``"loss_critic"``, ``"loss_cost"``, ClipPPOLoss's reports and
+    ``"lagrange_multiplier"``.
+
+    Raises:
+        ValueError: ``cost_limit`` is negative or not finite, or ``gamma`` lies outside [0, 1].
+        KeyError: the batch holds no cost, or ``begin`` has not seen it.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from saferl.modules import (
+        ...     DualAscent, MLPPolicyEncoder, StateValue, tanh_gaussian_actor, value_operator
+        ... )
+        >>> from saferl.objectives import PPOLagLoss
+        >>> def value(key):
+        ...     network = StateValue(MLPPolicyEncoder(rows=3, width=16), width=16)
+        ...     return value_operator(network, in_keys=("ego", "vehicles"), out_key=key)
+        >>> actor = tanh_gaussian_actor(MLPPolicyEncoder(rows=3, width=16), width=16)
+        >>> values = value("state_value"), value("state_cost_value")
+        >>> loss = PPOLagLoss(actor, *values, lagrange=DualAscent(init=1.0))
+        >>> state = {"ego": torch.randn(4, 8, 9), "vehicles": torch.randn(4, 8, 3, 6)}
+        >>> end = torch.zeros(4, 8, 1, dtype=torch.bool)
+        >>> following = {**state, "reward": torch.randn(4, 8, 1), "cost": torch.rand(4, 8, 1)}
+        >>> batch = TensorDict(
+        ...     {**state, "next": {**following, "done": end, "terminated": end}}, [4, 8]
+        ... )
+        >>> batch = actor(batch).detach()
+        >>> loss.begin(batch)
+        >>> output = loss(batch.reshape(-1)[:16])
+        >>> sum(value for key, value in output.items() if key.startswith("loss_")).backward()
+    """
+
+    _AcceptedKeys = CostKeys
+    default_keys = CostKeys
+
+    lagrange: LagrangeMultiplier
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        critic_network: TensorDictModule,
+        cost_critic: TensorDictModule,
+        *,
+        lagrange: LagrangeMultiplier,
+        cost_limit: float = 0.05,
+        entropy_bonus: bool = False,
+        normalize_advantage: bool = True,
+        loss_critic_type: str = "l2",
+        **settings: Any,
+    ) -> None:
+        super().__init__(
+            actor_network,
+            critic_network,
+            entropy_bonus=entropy_bonus,
+            normalize_advantage=normalize_advantage,
+            loss_critic_type=loss_critic_type,
+            **settings,
+        )
+        self._add_cost_value(cost_critic, cost_limit)
+        self.lagrange = lagrange
+
+    @dispatch()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        reward = tensordict.get(self.tensor_keys.advantage)
+        cost = tensordict.get(self.tensor_keys.cost_advantage)
+        multiplier = self.lagrange.value.detach().to(reward)
+        weighed = tensordict.clone(False)
+        weighed.set(self.tensor_keys.advantage, (reward - multiplier * cost) / (1.0 + multiplier))
+        # By name: LossModule gives each of its subclasses a forward, so that super() would find the base's.
+        out = ClipPPOLoss.forward(self, weighed)
+        out.set("loss_cost", self.cost_loss(tensordict))
+        out.set("lagrange_multiplier", self.lagrange.value.detach().clone())
+        self._clear_weakrefs(tensordict, out, "cost_critic_params", "target_cost_critic_params")
+        return out

@@ -1,0 +1,325 @@
+"""PPO-Lagrangian and CPO against loops, hand-made formulas and dense linear algebra."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.distributions import kl_divergence
+from torchrl.modules import TanhNormal
+from torchrl.objectives import ClipPPOLoss, ValueEstimators
+
+from saferl.modules import (
+    DualAscent,
+    MLPPolicyEncoder,
+    StateValue,
+    tanh_gaussian_actor,
+    value_operator,
+)
+from saferl.objectives import CPOLoss, PPOLagLoss
+from saferl.objectives.cpo import policy_kl
+from saferl.objectives.trust_region import CASES, flat
+
+GAMMA, LAMBDA, SIZE = 0.9, 0.8, 3
+LOSSES = {"ppo_lag": PPOLagLoss, "cpo": CPOLoss}
+
+
+def encoder() -> MLPPolicyEncoder:
+    return MLPPolicyEncoder(size=SIZE, width=8, depth=1)
+
+
+def value(key: str):
+    return value_operator(StateValue(encoder(), 8), in_keys=["observation"], out_key=key)
+
+
+def build(kind: str = "ppo_lag", seed: int = 0, **settings):
+    """A loss, and its actor as a module that acts."""
+    torch.manual_seed(seed)
+    actor = tanh_gaussian_actor(encoder(), 8, 2, in_keys=["observation"]).double()
+    parts = actor, value("state_value").double(), value("state_cost_value").double()
+    if kind == "ppo_lag":
+        settings = {"lagrange": DualAscent(init=0.7)} | settings
+    loss = LOSSES[kind](*parts, **settings)
+    loss.make_value_estimator(ValueEstimators.GAE, gamma=GAMMA, lmbda=LAMBDA)
+    return loss, actor
+
+
+def batch_of(actor, envs: int = 4, steps: int = 7, seed: int = 1) -> TensorDict:
+    """Transitions [B, T] in float64: an end by termination, one by truncation, and the rest cut off."""
+    torch.manual_seed(seed)
+    states = torch.randn(envs, steps + 1, SIZE, dtype=torch.float64)
+    terminated = torch.zeros(envs, steps, 1, dtype=torch.bool)
+    done = terminated.clone()
+    terminated[0, 3] = done[0, 3] = done[1, 2] = True
+    is_init = torch.zeros_like(done)
+    is_init[:, 0] = True
+    is_init[0, 4] = is_init[1, 3] = True
+    following = {
+        "observation": states[:, 1:],
+        "reward": torch.randn(envs, steps, 1, dtype=torch.float64),
+        "cost": torch.rand(envs, steps, 1, dtype=torch.float64),
+        "done": done,
+        "terminated": terminated,
+    }
+    data = {"observation": states[:, :-1], "is_init": is_init, "next": following}
+    with torch.no_grad():
+        return actor(TensorDict(data, [envs, steps]))
+
+
+@pytest.mark.parametrize("kind", LOSSES)
+def test_advantages_match_a_loop(kind: str):
+    """Of reward and of cost: through a truncation with the value behind it, not through a termination."""
+    loss, actor = build(kind)
+    data = batch_of(actor)
+    # CPO moves the policy in the same call; the values that the advantages use do not move.
+    loss.begin(data)
+    for name, params, key, advantage, target in (
+        ("critic_network", loss.critic_network_params, "reward", "advantage", "value_target"),
+        ("cost_critic", loss.cost_critic_params, "cost", "cost_advantage", "cost_value_target"),
+    ):
+        network = getattr(loss, name)
+        with torch.no_grad(), params.to_module(network):
+            now = network(data.select("observation"))[network.out_keys[0]].squeeze(-1)
+            then = network(data["next"].select("observation"))[network.out_keys[0]].squeeze(-1)
+        signal = data["next", key].squeeze(-1)
+        end, dead = (data["next", k].squeeze(-1) for k in ("done", "terminated"))
+        expected = torch.zeros_like(now)
+        for row in range(now.shape[0]):
+            running = 0.0
+            for t in reversed(range(now.shape[1])):
+                delta = signal[row, t] - now[row, t]
+                if not dead[row, t]:
+                    delta = delta + GAMMA * then[row, t]
+                running = delta + (0.0 if end[row, t] else GAMMA * LAMBDA * running)
+                expected[row, t] = running
+        torch.testing.assert_close(data[advantage].squeeze(-1), expected)
+        torch.testing.assert_close(data[target].squeeze(-1), expected + now)
+
+
+def test_objective_is_the_weighed_advantage_standardised_once():
+    loss, actor = build(entropy_bonus=False)
+    data = batch_of(actor)
+    loss.begin(data)
+    flat_data = data.reshape(-1)
+    with torch.no_grad():  # another policy than the one that acted
+        for parameter in loss.actor_network_params.values(True, True):
+            parameter.add_(0.05 * torch.randn_like(parameter))
+    out = loss(flat_data)
+    multiplier = 0.7
+    weighed = (flat_data["advantage"] - multiplier * flat_data["cost_advantage"]) / 1.7
+    standard = (weighed - weighed.mean()) / weighed.std()
+    with loss.actor_network_params.to_module(loss.actor_network):
+        dist = loss.actor_network.get_dist(flat_data.select("observation"))
+    ratio = (dist.log_prob(flat_data["action"]) - flat_data["action_log_prob"]).exp()[:, None]
+    gain = torch.minimum(ratio * standard, ratio.clamp(0.8, 1.2) * standard)
+    # TorchRL clamps the log-ratio to log1p(+-0.2), which is the same.
+    torch.testing.assert_close(out["loss_objective"], -gain.mean(), rtol=1e-3, atol=1e-6)
+    with loss.cost_critic_params.to_module(loss.cost_critic):
+        predicted = loss.cost_critic(flat_data.select("observation"))["state_cost_value"]
+    half = 0.5 * (predicted - flat_data["cost_value_target"]).square().mean()
+    torch.testing.assert_close(out["loss_cost"], half)
+    assert float(out["lagrange_multiplier"]) == multiplier
+
+
+def test_without_a_multiplier_it_is_torchrls_own():
+    loss, actor = build(lagrange=DualAscent(init=0.0))
+    torch.manual_seed(0)
+    theirs = ClipPPOLoss(
+        actor,
+        value("state_value").double(),
+        entropy_bonus=False,
+        normalize_advantage=True,
+        loss_critic_type="l2",
+    )
+    theirs.critic_network_params.data.copy_(loss.critic_network_params.data)
+    data = batch_of(actor)
+    loss.begin(data)
+    ours, other = loss(data.reshape(-1)), theirs(data.reshape(-1))
+    for key in ("loss_objective", "loss_critic", "kl_approx"):
+        torch.testing.assert_close(ours[key], other[key])
+
+
+@pytest.mark.parametrize("kind", LOSSES)
+def test_terms_reach_their_own_parameters(kind: str):
+    loss, actor = build(kind)
+    data = batch_of(actor)
+    loss.begin(data)
+    out = loss(data.reshape(-1))
+    reach = {
+        "loss_objective": "actor_network_params",
+        "loss_critic": "critic_network_params",
+        "loss_cost": "cost_critic_params",
+    }
+    for term, owner in reach.items():
+        if term not in out.keys():  # noqa: SIM118
+            continue
+        loss.zero_grad(set_to_none=True)
+        out[term].backward(retain_graph=True)
+        reached = {n.split(".")[0] for n, p in loss.named_parameters() if p.grad is not None}
+        assert reached == {owner}
+
+
+@pytest.mark.parametrize("kind", LOSSES)
+def test_a_loss_loads_another_ones_state(kind: str):
+    (one, actor), (two, _) = build(kind, seed=1), build(kind, seed=2)
+    two.load_state_dict(one.state_dict())
+    data, again = batch_of(actor), batch_of(actor)
+    one.begin(data)
+    two.begin(again)
+    for key, term in one(data.reshape(-1)).items():
+        if key.startswith("loss_"):
+            torch.testing.assert_close(term, two(again.reshape(-1))[key])
+
+
+def test_cost_of_the_policy_is_that_of_its_starts():
+    loss, actor = build("cpo")
+    data = batch_of(actor)
+    super(CPOLoss, loss).begin(data)
+    cost, weight = loss.cost_of_policy(data)
+    first = data["is_init"].squeeze(-1)
+    torch.testing.assert_close(cost, data["cost_value_target"].squeeze(-1)[first].mean())
+    length = data.numel() / int(first.sum())
+    assert float(weight) == pytest.approx((1 - GAMMA**length) / (1 - GAMMA))
+    # No episode begins: the mean over all states, and a weight of an endless one.
+    data["is_init"].zero_()
+    cost, weight = loss.cost_of_policy(data)
+    torch.testing.assert_close(cost, data["cost_value_target"].mean())
+    assert 0.9 / (1 - GAMMA) < float(weight) <= 1 / (1 - GAMMA)
+    loss.make_value_estimator(ValueEstimators.GAE, gamma=1.0, lmbda=LAMBDA)
+    data["is_init"][:, 0] = True
+    assert float(loss.cost_of_policy(data)[1]) == 7.0
+
+
+def test_kl_of_squashed_policies():
+    """Equal to that of the Gaussians, summed over an action's dimensions, and to samples."""
+    torch.manual_seed(0)
+    loc, scale = torch.randn(2, 5, 2), torch.rand(2, 5, 2) + 0.5
+    old, new = (TanhNormal(loc[i], scale[i]) for i in range(2))
+    normal = [torch.distributions.Normal(loc[i], scale[i]) for i in range(2)]
+    ours = policy_kl(old, new)
+    torch.testing.assert_close(ours, kl_divergence(*normal).sum(-1))
+    action = old.sample((40_000,))
+    sampled = old.log_prob(action) - new.log_prob(action)
+    error = sampled.std(0) / 200
+    assert ((sampled.mean(0) - ours).abs() < 5 * error).all()
+
+
+def policy(loss) -> torch.Tensor:
+    return flat(p.detach() for p in loss.actor_network_params.values(True, True))
+
+
+@pytest.mark.parametrize("limit", [0.0, 3.9, 4.2, 100.0])
+def test_a_step_keeps_what_it_promises(limit: float):
+    loss, actor = build("cpo", cost_limit=limit, trust=0.02, damping=0.01)
+    data = batch_of(actor, envs=64)
+    before = policy(loss)
+    data_flat = data.reshape(-1)
+    with loss.actor_network_params.to_module(loss.actor_network), torch.no_grad():
+        old = loss.actor_network.get_dist(data_flat.select("observation"))
+    loss.begin(data)
+    out = loss(data.reshape(-1))
+    (case,) = (name for name in CASES if out[f"cpo_{name}"] == 1)
+    with torch.no_grad():
+        reward, cost, kl = loss._surrogates(data.reshape(-1), old)
+    assert kl <= loss.trust and float(out["kl"]) == pytest.approx(float(kl), rel=1e-4)
+    assert float(out["step_fraction"]) > 0 and not torch.equal(policy(loss), before)
+    start = float(out["cost_estimate"])
+    if start > limit:
+        assert case in ("recoverable", "infeasible") and cost < 0
+    else:
+        assert case in ("unconstrained", "feasible") and reward > 0
+
+
+def test_fisher_products_and_direction_match_dense_algebra():
+    """The step that is tried first is the closed-form solution of the quadratic problem (1e-5)."""
+    loss, actor = build("cpo", cost_limit=4.0, damping=0.1, cg_steps=200)
+    data = batch_of(actor, envs=16)
+    super(CPOLoss, loss).begin(data)
+    cost, weight = loss.cost_of_policy(data)
+    violation = float((cost - loss.cost_limit) / weight)
+    flat_data = data.reshape(-1)
+    parameters = list(loss.actor_network_params.values(True, True))
+    with loss.actor_network_params.to_module(loss.actor_network), torch.no_grad():
+        old = loss.actor_network.get_dist(flat_data.select("observation"))
+    reward, price, kl = loss._surrogates(flat_data, old)
+    g, b = (
+        flat(torch.autograd.grad(term, parameters, retain_graph=True)) for term in (reward, price)
+    )
+    first = flat(torch.autograd.grad(kl, parameters, create_graph=True))
+    rows = [flat(torch.autograd.grad(each, parameters, retain_graph=True)) for each in first]
+    H = torch.stack(rows) + 0.1 * torch.eye(len(first), dtype=torch.float64)
+
+    tried = {}
+    loss._search = lambda batch, old, parameters, step, case, c: tried.update(step=step, case=case)
+    loss._step(flat_data, torch.tensor(violation))
+    x = tried["step"]
+    # Optimality of a convex problem, with multipliers fitted to the solution.
+    assert 0.5 * x @ H @ x <= loss.trust * (1 + 1e-6)
+    basis = torch.stack([g, -b], 1)
+    weights = torch.linalg.lstsq(basis, (H @ x)[:, None]).solution.squeeze(-1)
+    torch.testing.assert_close(basis @ weights, H @ x, rtol=1e-5, atol=1e-8)
+    assert tried["case"] in CASES and (weights >= -1e-9).all()
+
+
+def test_a_failed_search_restores_the_policy():
+    """Also where the surrogates are not finite (docs/pitfalls.md, 7)."""
+    loss, actor = build("cpo", cost_limit=100.0)
+    data = batch_of(actor)
+    before = policy(loss)
+    surrogates, calls = loss._surrogates, []
+
+    def broken(batch, old):
+        calls.append(None)
+        values = surrogates(batch, old)
+        return values if len(calls) <= 2 else tuple(value * math.nan for value in values)
+
+    loss._surrogates = broken
+    loss.begin(data)
+    assert torch.equal(policy(loss), before)
+    out = loss(data.reshape(-1))
+    assert out["step_fraction"] == 0 and out["kl"] == 0
+    assert len(calls) == 2 + loss.search_steps
+
+
+@pytest.mark.parametrize("kind", LOSSES)
+def test_refuses(kind: str):
+    loss, actor = build(kind)
+    data = batch_of(actor)
+    with pytest.raises(KeyError, match=r"no entry \('next', 'cost'\)"):
+        loss.begin(data.exclude(("next", "cost")))
+    with pytest.raises(ValueError, match=r"cost_limit must be >= 0, got -1"):
+        build(kind, cost_limit=-1)
+    with pytest.raises(ValueError, match=r"gamma must be in \[0, 1\], got 2"):
+        loss.make_value_estimator(ValueEstimators.GAE, gamma=2, lmbda=0.9)
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"trust": 0.0}, "trust must be > 0, got 0.0"),
+        ({"damping": math.nan}, "damping must be > 0, got nan"),
+        ({"cg_steps": 0}, "cg_steps must be >= 1, got 0"),
+        ({"search_steps": 0}, "search_steps must be >= 1, got 0"),
+        ({"backtrack": 1.0}, r"backtrack must be in \(0, 1\), got 1.0"),
+    ],
+)
+def test_cpo_refuses(setting: dict, message: str):
+    with pytest.raises(ValueError, match=message):
+        build("cpo", **setting)
+
+
+def test_cpo_needs_to_know_where_episodes_begin():
+    loss, actor = build("cpo")
+    with pytest.raises(KeyError, match=r"no entry 'is_init'.*InitTracker"):
+        loss.begin(batch_of(actor).exclude("is_init"))
+
+
+def test_keys_can_be_renamed():
+    loss, actor = build("cpo")
+    loss.set_keys(cost="price")
+    data = batch_of(actor)
+    data.rename_key_(("next", "cost"), ("next", "price"))
+    loss.begin(data)
+    assert loss(data.reshape(-1))["loss_cost"].isfinite()
