@@ -14,19 +14,23 @@ from saferl.modules.mlp import MLPPolicyEncoder, MLPValue
 from saferl.modules.mmam import EGO_SCALE, VEHICLE_SCALE, MMAMPolicyEncoder, MMAMValue
 from saferl.modules.plain import PlainMMAMPolicyEncoder, PlainMMAMValue
 from saferl.modules.projection import ProjectionResult, project
+from saferl.modules.risk import CVaR, Largest, MeanStd
 
 __all__ = [
     "EGO_SCALE",
     "VEHICLE_SCALE",
     "BoundCritics",
+    "CVaR",
     "CriticEnsemble",
     "DualAscent",
     "GaussianHead",
     "LagrangeMultiplier",
+    "Largest",
     "MLPPolicyEncoder",
     "MLPValue",
     "MMAMPolicyEncoder",
     "MMAMValue",
+    "MeanStd",
     "PIDMultiplier",
     "PlainMMAMPolicyEncoder",
     "PlainMMAMValue",

@@ -22,6 +22,14 @@ REDUCTIONS: dict[str, Callable[[Tensor], Tensor]] = {
 }
 
 
+Reduction = str | Callable[[Tensor], Tensor]
+
+
+def reduction(reduce: Reduction) -> Callable[[Tensor], Tensor]:
+    """The function that a reduction is, or names."""
+    return REDUCTIONS[reduce] if isinstance(reduce, str) else reduce
+
+
 class StateValue(nn.Module):
     """A linear value on top of an encoder, V(s), for on-policy algorithms.
 
@@ -55,8 +63,9 @@ def zero_output(network: nn.Module) -> nn.Module:
     then corrects nearly every one of them, and a multiplier pushes the policy away from nothing.
 
     Args:
-        network: a module whose read-outs are its linear layers with one output, such as
-            :class:`MMAMValue` or :class:`MLPValue`; changed in place and returned.
+        network: a module that lists its read-outs as ``readouts``, as :class:`MMAMValue` and
+            :class:`MLPValue` do, or whose read-outs are its linear layers with one output; changed in
+            place and returned.
 
     Raises:
         ValueError: the network has no such layer.
@@ -68,7 +77,7 @@ def zero_output(network: nn.Module) -> nn.Module:
         >>> value(torch.randn(5, 9), torch.zeros(5, 3, 6), torch.ones(5, 2)).abs().max().item()
         0.0
     """
-    readouts = [
+    readouts = getattr(network, "readouts", None) or [
         module
         for module in network.modules()
         if isinstance(module, nn.Linear) and module.out_features == 1
@@ -113,7 +122,8 @@ class BoundCritics:
         value: a member's value [*B, 1] from its scene and actions [*B, A].
         scenes: what each member knows of the states, with the weights that meet the action: a tuple
             of the members' scenes, or one scene of stacked tensors [n, ...], evaluated at once.
-        reduce: ``"max"``, ``"min"`` or ``"mean"``, what a call makes of the members' values.
+        reduce: what a call makes of the members' values [n, *B, K]: ``"max"``, ``"min"``, ``"mean"``, or a
+            function to [*B, 1].
 
     Examples:
         >>> import torch
@@ -129,7 +139,7 @@ class BoundCritics:
 
     value: Callable[[Any, Tensor], Tensor]
     scenes: Any
-    reduce: str = "max"
+    reduce: Reduction = "max"
 
     @classmethod
     def of(
@@ -139,7 +149,7 @@ class BoundCritics:
         tensordict: TensorDictBase,
         *,
         action_key: NestedKey = "action",
-        reduce: str = "max",
+        reduce: Reduction = "max",
         vmap: bool | None = None,
     ) -> BoundCritics:
         """Binds critics to the states in ``tensordict``, of which the action is not read.
@@ -186,7 +196,7 @@ class BoundCritics:
 
     def __call__(self, action: Tensor) -> Tensor:
         """The members' values reduced to one, [*B, 1]."""
-        return REDUCTIONS[self.reduce](self.values(action))
+        return reduction(self.reduce)(self.values(action))
 
     def detach(self) -> BoundCritics:
         """The same, differentiable with respect to the action alone."""
@@ -205,7 +215,8 @@ class CriticEnsemble(TensorDictModuleBase):
         params: stacked parameters [n, ...] of a template, such as a loss's
             ``loss.cost_critic_params``. The ensemble then is a view: it reads these very tensors at
             each call, and they are neither in its ``parameters()`` nor in its ``state_dict()``.
-        reduce: ``"max"``, ``"min"`` or ``"mean"`` over the members.
+        reduce: ``"max"``, ``"min"`` or ``"mean"`` over the members, or a function of their values
+            [n, *B, K] to [*B, 1], such as :class:`saferl.modules.MeanStd`.
         action_key: the entry that :meth:`bind` leaves open.
 
     Attributes:
@@ -241,11 +252,11 @@ class CriticEnsemble(TensorDictModuleBase):
         members: Sequence[TensorDictModuleBase] | TensorDictModuleBase,
         params: TensorDictParams | None = None,
         *,
-        reduce: str = "max",
+        reduce: Reduction = "max",
         action_key: NestedKey = "action",
     ):
         super().__init__()
-        if reduce not in REDUCTIONS:
+        if isinstance(reduce, str) and reduce not in REDUCTIONS:
             raise ValueError(f"reduce must be one of {sorted(REDUCTIONS)}, got {reduce!r}.")
         if isinstance(members, TensorDictModuleBase):
             if params is None:
@@ -293,4 +304,4 @@ class CriticEnsemble(TensorDictModuleBase):
         return self.bind(tensordict).values(tensordict.get(self.action_key))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.set(self.out_keys[0], REDUCTIONS[self.reduce](self.values(tensordict)))
+        return tensordict.set(self.out_keys[0], reduction(self.reduce)(self.values(tensordict)))

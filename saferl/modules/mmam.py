@@ -171,6 +171,8 @@ class MMAMPolicyEncoder(nn.Module):
         torch.Size([5, 32])
     """
 
+    in_keys = ("ego", "vehicles")
+
     def __init__(
         self,
         width: int = 256,
@@ -226,9 +228,12 @@ class MMAMValue(nn.Module):
         pair_width: units of the layer applied to each SV (ours); ``None`` is ``width // 4``.
         ego_scale: divisors of the ego features.
         vehicle_scale: divisors of a vehicle's features; I_veh comes first.
+        outputs: K, more than one for the quantiles of a distributional critic; what the attention reads
+            shifts them all alike (ours).
+        layer_norm: normalise each layer of the MLP branch before its activation, without gain or bias.
 
     Reads ``ego`` [*B, 9], ``vehicles`` [*B, M, 6] (SI units) and ``action`` [*B, 2] in [-1, 1];
-    returns values [*B, 1].
+    returns values [*B, K].
 
     Raises:
         ValueError: as :class:`MMAMPolicyEncoder`, or if ``branch`` is unknown.
@@ -245,6 +250,8 @@ class MMAMValue(nn.Module):
         True
     """
 
+    in_keys = ("ego", "vehicles")
+
     def __init__(
         self,
         width: int = 256,
@@ -256,6 +263,8 @@ class MMAMValue(nn.Module):
         pair_width: int | None = None,
         ego_scale: Sequence[float] = EGO_SCALE,
         vehicle_scale: Sequence[float] = VEHICLE_SCALE,
+        outputs: int = 1,
+        layer_norm: bool = False,
     ):
         super().__init__()
         if depth < 1:
@@ -273,7 +282,16 @@ class MMAMValue(nn.Module):
         self.joint = _Linear(2 * width + pooled, width)
         self.layers = nn.ModuleList(_Linear(width, width) for _ in range(depth - 1))
         self.w_attn = _Linear(width, 1, bias=False)
-        self.w_mlp = _Linear(width, 1, bias=False)
+        self.w_mlp = _Linear(width, outputs, bias=False)
+        self.layer_norm = layer_norm
+
+    @property
+    def readouts(self) -> list[nn.Linear]:
+        """What the output is the sum of."""
+        return [self.w_attn, self.w_mlp]
+
+    def _activate(self, hidden: Tensor) -> Tensor:
+        return F.gelu(F.layer_norm(hidden, hidden.shape[-1:]) if self.layer_norm else hidden)
 
     def encode(self, ego: Tensor, vehicles: Tensor) -> dict[str, Any]:
         """All that :meth:`value` needs: what no action changes, and the weights on the action."""
@@ -302,9 +320,8 @@ class MMAMValue(nn.Module):
         scene |= {"action": [self.action.weight, self.action.bias], "w_mlp": self.w_mlp.weight}
         return scene | {"layers": [[layer.weight, layer.bias] for layer in self.layers]}
 
-    @staticmethod
-    def value(scene: dict[str, Any], action: Tensor) -> Tensor:
-        """The value of ``action`` [*B, A] in the states of ``scene``, [*B, 1]."""
+    def value(self, scene: dict[str, Any], action: Tensor) -> Tensor:
+        """The value of ``action`` [*B, A] in the states of ``scene``, [*B, K]."""
         token = F.gelu(_linear(action, *scene["action"]))
         logit = (scene["query"] @ token.unsqueeze(-1)).squeeze(-1)
         weights = torch.cat([scene["logits"], logit.unsqueeze(-1)], dim=-1).softmax(-1)
@@ -320,8 +337,8 @@ class MMAMValue(nn.Module):
             pooled = (pairs * scene["share"]).sum(-2)
             y_mlp = y_mlp + _linear(pooled, scene["joint_on_pooled"])
         for weight, bias in scene["layers"]:
-            y_mlp = _linear(F.gelu(y_mlp), weight, bias)
-        return y_attn.unsqueeze(-1) + _linear(F.gelu(y_mlp), scene["w_mlp"])
+            y_mlp = _linear(self._activate(y_mlp), weight, bias)
+        return y_attn.unsqueeze(-1) + _linear(self._activate(y_mlp), scene["w_mlp"])
 
     def forward(self, ego: Tensor, vehicles: Tensor, action: Tensor) -> Tensor:
         return self.value(self.encode(ego, vehicles), action)

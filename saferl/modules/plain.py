@@ -94,7 +94,7 @@ class PlainMMAMValue(MMAMValue):
             pairs = F.gelu(self.pair(torch.cat([vehicle_tokens, *rest], dim=-1)))
         pooled = (pairs * share).sum(-2) / share.sum(-2).clamp(min=1.0)
         parts = [ego_token.squeeze(-2), action_token.squeeze(-2), pooled]
-        y_mlp = F.gelu(self.joint(torch.cat(parts, dim=-1)))
+        y_mlp = self._activate(self.joint(torch.cat(parts, dim=-1)))
         for layer in self.layers:
-            y_mlp = F.gelu(layer(y_mlp))
+            y_mlp = self._activate(layer(y_mlp))
         return self.w_attn(y_attn) + self.w_mlp(y_mlp)

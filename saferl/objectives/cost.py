@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from copy import deepcopy
 from typing import Any
 
@@ -14,11 +15,31 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import distance_loss
 
-from saferl.modules import BoundCritics, CriticEnsemble, LagrangeMultiplier
+from saferl.modules import BoundCritics, CriticEnsemble, LagrangeMultiplier, Largest
 from saferl.modules.critics import REDUCTIONS
 
 #: What the cost critics' target may be of its members' values.
 COST_TARGETS = ("max", "mean")
+#: What the cost critics may learn: the discounted sum of costs, or the largest one ahead.
+COST_BACKUPS = ("sum", "reach")
+
+
+def quantile_loss(predicted: Tensor, target: Tensor) -> Tensor:
+    """Quantile regression with Huber's loss of width 1 (Dabney et al., 2018), summed over the quantiles.
+
+    Args:
+        predicted: [*B, K], the quantiles at (i + 1/2) / K.
+        target: [*B, L], samples of the distribution, equally likely.
+
+    Returns:
+        [*B].
+    """
+    count = predicted.shape[-1]
+    fraction = (torch.arange(count, device=predicted.device, dtype=predicted.dtype) + 0.5) / count
+    error = target.unsqueeze(-2) - predicted.unsqueeze(-1)  # [*B, K, L]
+    huber = torch.where(error.abs() < 1.0, 0.5 * error.square(), error.abs() - 0.5)
+    below = (error.detach() < 0).to(predicted)
+    return ((fraction.unsqueeze(-1) - below).abs() * huber).mean(-1).sum(-1)
 
 
 class CostCriticLoss(LossModule):
@@ -35,8 +56,11 @@ class CostCriticLoss(LossModule):
 
     where :math:`\tau` is ``terminated``, and the mean over :math:`j` may take the place of
     the maximum (``cost_target="mean"``): the maximum of members that differ by chance is
-    too high, and each target passes that on to the next one. The subclass calls :meth:`_add_cost_critic`
-    once its other networks are there, and defines :meth:`_sample_next`.
+    too high, and each target passes that on to the next one. With ``cost_backup="reach"`` the target is
+    :math:`(1 - \gamma) c + \gamma \max(c, (1 - \tau) Q_c^-)`, whose fixed point is the discounted largest cost
+    ahead (Fisac et al., 2019). A critic with K > 1 outputs learns the quantiles of the sum, by
+    :func:`quantile_loss`. What is made of the members' values elsewhere is ``risk``. The subclass calls
+    :meth:`_add_cost_critic` once its other networks are there, and defines :meth:`_sample_next`.
     """
 
     SUPPORTED_VALUE_ESTIMATORS = (ValueEstimators.TD0,)
@@ -47,6 +71,8 @@ class CostCriticLoss(LossModule):
     lagrange: LagrangeMultiplier
     cost_limit: Tensor
     cost_target: str
+    cost_backup: str
+    risk: Callable[[Tensor], Tensor]
 
     # Of the loss beside this base, or made late.
     tensor_keys: Any
@@ -64,6 +90,8 @@ class CostCriticLoss(LossModule):
         lagrange: LagrangeMultiplier,
         cost_limit: float,
         cost_target: str,
+        cost_backup: str,
+        risk: Callable[[Tensor], Tensor] | None,
         create_target_params: bool,
         compare_against: list[nn.Parameter] | None,
     ) -> None:
@@ -71,11 +99,14 @@ class CostCriticLoss(LossModule):
             raise ValueError(f"cost_limit must be >= 0, got {cost_limit}.")
         if num_cost_critics < 1:
             raise ValueError(f"num_cost_critics must be >= 1, got {num_cost_critics}.")
-        if cost_target not in COST_TARGETS:
-            raise ValueError(
-                f"cost_target must be one of {', '.join(COST_TARGETS)}, got {cost_target!r}."
-            )
+        for name, value, choices in (
+            ("cost_target", cost_target, COST_TARGETS),
+            ("cost_backup", cost_backup, COST_BACKUPS),
+        ):
+            if value not in choices:
+                raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}.")
         self.num_cost_critics, self.cost_target = num_cost_critics, cost_target
+        self.cost_backup, self.risk = cost_backup, risk or Largest()
         self.convert_to_functional(
             cost_critic,  # pyright: ignore[reportArgumentType]
             "cost_critic",
@@ -148,7 +179,7 @@ class CostCriticLoss(LossModule):
 
     @property
     def cost_value(self) -> CriticEnsemble:
-        """The largest cost value over the members, on their live parameters.
+        """The risk of the members' cost values, on their live parameters.
 
         A view that owns no state. It keeps following the parameters as they are
         trained and loaded, but not a ``to(device)`` that replaces them: take it anew.
@@ -156,7 +187,7 @@ class CostCriticLoss(LossModule):
         return CriticEnsemble(
             self.cost_critic,
             params=self.cost_critic_params,
-            reduce="max",
+            reduce=self.risk,
             action_key=self.tensor_keys.action,
         )
 
@@ -174,7 +205,7 @@ class CostCriticLoss(LossModule):
         next_sample: tuple[TensorDictBase, Tensor] | None = None,
         critics: BoundCritics | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """E13: cost critics against the target value, with no entropy.
+        """E13: cost critics against the target value or its quantiles, with no entropy.
 
         Args:
             tensordict (TensorDictBase): the batch.
@@ -199,12 +230,31 @@ class CostCriticLoss(LossModule):
             )
             next_value = target_critics.values(next_state.get(self.tensor_keys.action))
             next_value = REDUCTIONS[self.cost_target](next_value)
-            target = self._cost_value_estimator.value_estimate(
-                tensordict.copy(), next_value=next_value
-            )
+            target = self._cost_backup(tensordict, next_value)
         critics = critics or self._bind(self.cost_critic, self.cost_critic_params, tensordict)
         predicted = critics.values(tensordict.get(self.tensor_keys.action))
-        return self._bellman_loss(predicted, target, tensordict)
+        if predicted.shape[-1] == 1:
+            return self._bellman_loss(predicted, target, tensordict)
+        loss = quantile_loss(predicted, target.expand_as(predicted)).sum(0)
+        loss = self._reduce_loss(
+            loss, tensordict=tensordict, weights=self._maybe_get_priority_weight(tensordict)
+        )
+        error = predicted.mean(-1) - target.mean(-1)
+        return loss, {"td_error": error.detach().abs().max(0)[0]}
+
+    def _cost_backup(self, tensordict: TensorDictBase, next_value: Tensor) -> Tensor:
+        """The cost critics' target [*B, K] from the next state's values [*B, K]."""
+        estimator = self._cost_value_estimator
+        if self.cost_backup == "sum":
+            data, keys = tensordict.copy(), self.tensor_keys
+            following = data.get("next").copy()
+            for key in (keys.cost, keys.done, keys.terminated):  # estimators want one shape of all
+                following.set(key, following.get(key).expand_as(next_value))
+            return estimator.value_estimate(data.set("next", following), next_value=next_value)
+        cost = tensordict.get(("next", self.tensor_keys.cost))
+        terminated = tensordict.get(("next", self.tensor_keys.terminated))
+        gamma, ahead = estimator.gamma.to(cost), torch.where(terminated, 0.0, next_value)
+        return (1.0 - gamma) * cost + gamma * torch.maximum(cost, ahead)
 
     def _bellman_loss(
         self, predicted: Tensor, target: Tensor, tensordict: TensorDictBase

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -63,6 +64,12 @@ class SACLagLoss(CostCriticLoss, SACLoss):
             unit of ``cost``. Defaults to ``0.05``.
         cost_target ("max" or "mean", optional): what :math:`Q_c^-` is of the members of
             the target. Defaults to ``"max"`` (paper), whose overestimate feeds itself.
+        cost_backup ("sum" or "reach", optional): what the cost critics learn, the discounted sum of
+            costs (paper) or the discounted largest one ahead, a reachability. Defaults to ``"sum"``.
+        risk (callable, optional): what :math:`Q_c(s, \tilde a)` is of the members' values
+            ``[n, *B, K]``. Defaults to :class:`~saferl.modules.Largest` (paper).
+        rescale (bool, optional): divide the actor's loss by :math:`1 + \lambda`, so that its size does
+            not grow with the multiplier. Defaults to ``False`` (paper).
         num_qvalue_nets (int, optional): reward critics. Defaults to ``2``.
         num_cost_critics (int, optional): cost critics. Defaults to ``2``.
         delay_qvalue (bool, optional): keep target copies of both kinds of
@@ -149,6 +156,9 @@ class SACLagLoss(CostCriticLoss, SACLoss):
         lagrange: LagrangeMultiplier,
         cost_limit: float = 0.05,
         cost_target: Literal["max", "mean"] = "max",
+        cost_backup: Literal["sum", "reach"] = "sum",
+        risk: Callable[[Tensor], Tensor] | None = None,
+        rescale: bool = False,
         num_qvalue_nets: int = 2,
         num_cost_critics: int = 2,
         alpha_init: float = 1.0,
@@ -189,9 +199,12 @@ class SACLagLoss(CostCriticLoss, SACLoss):
             lagrange=lagrange,
             cost_limit=cost_limit,
             cost_target=cost_target,
+            cost_backup=cost_backup,
+            risk=risk,
             create_target_params=delay_qvalue,
             compare_against=list(actor_network.parameters()) if separate_losses else None,
         )
+        self.rescale = rescale
         # Resolved now rather than in the first forward, which would break a compiled graph.
         _ = self.target_entropy
         self.out_keys = [*_LOSSES, "constraint_violation"]
@@ -266,10 +279,12 @@ class SACLagLoss(CostCriticLoss, SACLoss):
         sample, log_prob = self._sample_action(tensordict)
         action = sample.get(self.tensor_keys.action)
         qvalue = reward.detach().values(action).min(0)[0]
-        cost_value = cost.detach().values(action).max(0)[0]
+        cost_value = self.risk(cost.detach().values(action))
         penalty = self.lagrange.penalty(cost_value.squeeze(-1) - self.cost_limit)
         multiplier = self.lagrange.value.detach().to(penalty)
         loss_actor = self._alpha * log_prob - qvalue.squeeze(-1) + multiplier * penalty
+        if self.rescale:
+            loss_actor = loss_actor / (1.0 + multiplier)
         metadata = {
             "log_prob": log_prob.detach(),
             "constraint_violation": self._reduce_loss(
