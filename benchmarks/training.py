@@ -80,7 +80,7 @@ def train(overrides: list[str]) -> dict:
             if hasattr(transform, "latencies"):
                 watch.wrap(transform, "_inv_call", "project")
         watch.wrap(trainer.learner, "update", "learn")
-        watch.wrap(trainer.buffer, "sample", "learn")
+        watch.wrap(trainer.experience.buffer, "sample", "learn")
         trainer.train()
     wall = time.perf_counter() - begin
     watch.seconds["other"] = wall - sum(watch.seconds.values())

@@ -10,36 +10,45 @@ from typing import Any
 
 import hydra
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import EnvBase, RewardScaling, RewardSum, TransformedEnv
+from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
+from torchrl.envs import EnvBase, InitTracker, RewardScaling, RewardSum, TransformedEnv
 from torchrl.envs.transforms import Compose, Transform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import AdditiveGaussianModule
-from torchrl.objectives import LossModule, SoftUpdate
+from torchrl.objectives import LossModule, SoftUpdate, ValueEstimators
 
 from saferl.checkpoint import latest, load_component, run_config
 from saferl.components import Fitting, Networks
-from saferl.envs.intersection import Scenario
 from saferl.envs.intersection.drivers import CautiousDriver, Driver
 from saferl.envs.transforms import ExecutedAction, SafetyProjector
+from saferl.experience import Epochs, Replay
 from saferl.hooks import ProjectorProgress
 from saferl.learner import Learner
-from saferl.modules import compiled, tanh_gaussian_actor, value_operator, zero_output
+from saferl.modules import (
+    StateValue,
+    compiled,
+    tanh_gaussian_actor,
+    value_operator,
+    zero_output,
+)
 from saferl.progress import Budget
 from saferl.trainer import Trainer
-from saferl.validation import check_training
+from saferl.validation import check_targets, check_training
 
-#: What the replay buffer keeps of a transition.
+#: What is kept of a transition besides the observation.
 STORED = (
-    "ego",
-    "vehicles",
     "action",
-    *(("next", key) for key in ("ego", "vehicles", "reward", "cost", "done", "terminated")),
+    *(("next", key) for key in ("reward", "cost", "done", "terminated")),
     ("next", "action_executed"),
+)
+#: What on-policy losses read besides, once their ``begin`` has seen it.
+ADVANTAGES = (
+    *("action_log_prob", "advantage", "value_target", "state_value"),
+    *("cost_advantage", "cost_value_target"),
 )
 
 
@@ -65,7 +74,7 @@ def make(node: DictConfig, **objects: Any) -> Any:
 
 
 def build_env(
-    cfg: DictConfig, scenario: Scenario, num_envs: int, seed: int, *transforms: Transform
+    cfg: DictConfig, scenario: Any, num_envs: int, seed: int, *transforms: Transform
 ) -> EnvBase:
     """The configured backend with a scenario; transforms from the inside outwards."""
     env = make(cfg.env, scenario=scenario, num_envs=num_envs, seed=seed, device=device_of(cfg))
@@ -73,7 +82,7 @@ def build_env(
 
 
 @torch.no_grad()
-def demonstrate(cfg: DictConfig, scenario: Scenario) -> TensorDict:
+def demonstrate(cfg: DictConfig, scenario: Any) -> TensorDict:
     """Transitions [N] of scripted drivers for the replay buffer, N at least ``cfg.demonstrations``.
 
     Half of them are a cautious driver's and half a blind one's, all with Gaussian noise of 0.2 on
@@ -107,23 +116,59 @@ class Agent:
     projector: SafetyProjector | None
 
 
+def observed(cfg: DictConfig) -> tuple[str, ...]:
+    """Keys of what the configured task observes."""
+    return ("observation",) if "size" in cfg.task else ("ego", "vehicles")
+
+
+def complete(cfg: DictConfig) -> None:
+    """Write into a configuration what its task takes from the environment itself.
+
+    Raises:
+        ValueError: the task's settings cannot be meant.
+    """
+    check_targets(cfg.task, "task")
+    task = hydra.utils.instantiate(cfg.task)
+    if hasattr(task, "complete"):
+        OmegaConf.update(cfg, "task", task.complete())
+
+
+def _takes(cfg: DictConfig) -> set[str]:
+    """Names of what the configured loss is built from."""
+    return set(inspect.signature(hydra.utils.get_object(cfg.loss._target_)).parameters)
+
+
+def on_policy(cfg: DictConfig) -> bool:
+    """Whether the configured loss has state values, and so learns from fresh transitions alone."""
+    return "critic_network" in _takes(cfg)
+
+
 def _check_parts(cfg: DictConfig) -> None:
     """Refuse parts that do not go together."""
-    takes = inspect.signature(hydra.utils.get_object(cfg.loss._target_)).parameters
-    constrained = "cost_critic" in takes
+    takes, loss = _takes(cfg), cfg.loss._target_
+    fresh = "critic_network" in takes
     parts = {
         "cost_critic": cfg.cost_critic.members > 0,
         "lagrange": cfg.lagrange.multiplier is not None,
     }
     for name, present in parts.items():
-        if present and not constrained:
+        if present and name not in takes:
+            raise ValueError(f"{loss} takes no {name}: set {name}=none, or loss=sac_lag.")
+        if name in takes and not present:
+            raise ValueError(f"{loss} needs {name}, got {name}=none.")
+    if cfg.projector._target_ is not None and (fresh or "cost_critic" not in takes):
+        raise ValueError(
+            f"projector needs cost critics Q_c(s, a), which {loss} has not: "
+            "set projector=none, or loss=sac_lag."
+        )
+    for name in ("critic", "cost_critic"):
+        if fresh and cfg[name].members > 1:
             raise ValueError(
-                f"{cfg.loss._target_} takes no {name}: set {name}=none, or loss=sac_lag."
+                f"{loss} has one state value: set {name}=single, got {cfg[name].members} members."
             )
-        if constrained and not present:
-            raise ValueError(f"{cfg.loss._target_} needs {name}, got {name}=none.")
-    if cfg.projector._target_ is not None and not constrained:
-        raise ValueError("projector needs cost critics: set projector=none, or loss=sac_lag.")
+    if fresh != cfg.experience._target_.endswith("Epochs"):
+        name = "epochs" if fresh else "replay"
+        raise ValueError(f"{loss} learns from experience={name}, got {cfg.experience._target_}.")
 
 
 def build_agent(cfg: DictConfig) -> Agent:
@@ -133,33 +178,63 @@ def build_agent(cfg: DictConfig) -> Agent:
         ValueError: parts that do not go together.
     """
     _check_parts(cfg)
-    device = device_of(cfg)
-    width = cfg.encoder.policy.width
-    actor = tanh_gaussian_actor(hydra.utils.instantiate(cfg.encoder.policy), width).to(device)
+    device, takes, keys = device_of(cfg), _takes(cfg), observed(cfg)
+    width, action_dim = cfg.encoder.policy.width, cfg.task.get("action_dim", 2)
 
-    def networks(members: int) -> list[torch.nn.Module]:
-        return [hydra.utils.instantiate(cfg.encoder.value).to(device) for _ in range(members)]
+    def policy_encoder() -> torch.nn.Module:
+        return hydra.utils.instantiate(cfg.encoder.policy)
 
+    def action_values(critics: DictConfig) -> list[torch.nn.Module]:
+        # Only what differs, so that an encoder need not know of options that it is not asked for.
+        asked = {"outputs": critics.get("outputs", 1), "layer_norm": critics.get("layer_norm")}
+        options = {key: value for key, value in asked.items() if value not in (1, False, None)}
+        return [
+            hydra.utils.instantiate(cfg.encoder.value, **options).to(device)
+            for _ in range(critics.members)
+        ]
+
+    def state_value(out_key: str) -> torch.nn.Module:
+        network = StateValue(policy_encoder(), width).to(device)
+        return value_operator(network, in_keys=keys, out_key=out_key)
+
+    def action_value(network: torch.nn.Module, out_key: str) -> torch.nn.Module:
+        return value_operator(network, in_keys=(*keys, "action"), out_key=out_key)
+
+    def cost_critic() -> Any:
+        if on_policy(cfg):
+            return state_value("state_cost_value")
+        # At 0, or a projector would correct every action before the first cost was seen.
+        return [
+            action_value(zero_output(network), "state_action_cost_value")
+            for network in action_values(cfg.cost_critic)
+        ]
+
+    encoder = policy_encoder()
+    wanted: Any = encoder.in_keys
+    if tuple(wanted) != keys:
+        raise ValueError(
+            f"{cfg.encoder.policy._target_} reads {', '.join(wanted)}, but task={cfg.task.task} observes "
+            f"{', '.join(keys)}: set encoder=mlp, or an algorithm without attention (rsac, sac, ...)."
+        )
+    actor = tanh_gaussian_actor(encoder, width, action_dim, keys).to(device)
     parts = {
-        "actor_network": actor,
-        "qvalue_network": [value_operator(network) for network in networks(cfg.critic.members)],
-        "num_qvalue_nets": cfg.critic.members,
-        "target_entropy": cfg.target_entropy,
-        "alpha_init": cfg.alpha_init,
+        "actor_network": lambda: actor,
+        "qvalue_network": lambda: [
+            action_value(network, "state_action_value") for network in action_values(cfg.critic)
+        ],
+        "num_qvalue_nets": lambda: cfg.critic.members,
+        "critic_network": lambda: state_value("state_value"),
+        "cost_critic": cost_critic,
+        "num_cost_critics": lambda: cfg.cost_critic.members,
+        "lagrange": lambda: hydra.utils.instantiate(cfg.lagrange.multiplier),
+        "target_entropy": lambda: cfg.target_entropy,
+        "alpha_init": lambda: cfg.alpha_init,
     }
-    if cfg.cost_critic.members:
-        parts |= {
-            # At 0, or a projector would correct every action before the first cost was seen.
-            "cost_critic": [
-                value_operator(zero_output(network), out_key="state_action_cost_value")
-                for network in networks(cfg.cost_critic.members)
-            ],
-            "num_cost_critics": cfg.cost_critic.members,
-        }
-    if cfg.lagrange.multiplier is not None:
-        parts["lagrange"] = hydra.utils.instantiate(cfg.lagrange.multiplier)
-    loss = make(cfg.loss, **parts).to(device)
-    loss.make_value_estimator(gamma=cfg.gamma)
+    loss = make(cfg.loss, **{k: part() for k, part in parts.items() if k in takes}).to(device)
+    if on_policy(cfg):
+        loss.make_value_estimator(ValueEstimators.GAE, gamma=cfg.gamma, lmbda=cfg.gae_lambda)
+    else:
+        loss.make_value_estimator(gamma=cfg.gamma)
     projector = None
     if cfg.projector._target_ is not None:
         projector = make(cfg.projector, risk=loss.cost_value)
@@ -231,6 +306,11 @@ def build_optimizer(cfg: DictConfig, loss: LossModule) -> torch.optim.Optimizer:
     )
 
 
+def _has_targets(loss: LossModule) -> bool:
+    """Whether some network has target parameters of its own."""
+    return any(name.startswith("target_") for name, _ in loss.named_buffers())
+
+
 def build_learner(cfg: DictConfig, loss: LossModule) -> Learner:
     """What makes an update of a loss: optimizer, targets, order, and whether it is compiled."""
     # A GPU would wait for Python between the many small kernels of a loss: CUDA graphs.
@@ -238,9 +318,51 @@ def build_learner(cfg: DictConfig, loss: LossModule) -> Learner:
     return Learner(
         loss,
         build_optimizer(cfg, loss),
-        SoftUpdate(loss, tau=cfg.tau),
+        SoftUpdate(loss, tau=cfg.tau) if _has_targets(loss) else None,
         order=cfg.get("update_order", "joint"),  # a run from before this setting has none
         compile=partial(compiled, mode=mode) if cfg.compile else None,
+    )
+
+
+def build_experience(cfg: DictConfig, agent: Agent, scenario: Any) -> Replay | Epochs:
+    """What the learner updates from: a replay buffer, or each batch of fresh transitions."""
+    device = device_of(cfg)
+    generator = torch.Generator(device).manual_seed(cfg.seed)
+    keys = (*observed(cfg), *(("next", key) for key in observed(cfg)))
+    if on_policy(cfg):
+        loss: Any = agent.loss
+        frames = cfg.collector.frames_per_env * cfg.env.num_envs
+        # TorchRL's own losses leave their advantages to their estimator.
+        begin = getattr(loss, "begin", None) or partial(
+            loss.value_estimator,
+            params=loss.critic_network_params.detach(),
+            target_params=loss.target_critic_network_params,
+        )
+        buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(frames, device=device),
+            sampler=SamplerWithoutReplacement(),
+            batch_size=cfg.batch_size,
+            generator=generator,
+        )
+        stored = (*keys, *STORED, *ADVANTAGES)
+        return make(
+            cfg.experience, buffer=buffer, stored=stored, begin=begin, reward_scale=cfg.reward_scale
+        )
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(cfg.buffer_size, device=device),
+        batch_size=cfg.batch_size,
+        generator=generator,
+    )
+    buffer.append_transform(RewardScaling(0.0, cfg.reward_scale, in_keys=[("next", "reward")]))
+    if agent.projector is not None:
+        buffer.append_transform(ExecutedAction())
+    return make(
+        cfg.experience,
+        buffer=buffer,
+        stored=(*keys, *STORED),
+        updates_per_frame=cfg.updates_per_frame,
+        warmup_frames=cfg.warmup_frames,
+        demonstrate=partial(demonstrate, cfg, scenario) if cfg.get("demonstrations") else None,
     )
 
 
@@ -267,6 +389,7 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         ValueError: something in the configuration cannot be meant; names the key.
         FileNotFoundError: ``init`` names no checkpoint.
     """
+    complete(cfg)
     check_training(cfg)
     budget = Budget(cfg.episodes, cfg.frames)
     torch.set_num_threads(cfg.threads)
@@ -277,7 +400,11 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         begin_from(agent, cfg, Path(cfg.init))
 
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
-    transforms = [sums, agent.projector] if agent.projector else [sums]
+    transforms: list[Transform] = [sums]
+    if on_policy(cfg):
+        transforms.append(InitTracker())
+    if agent.projector is not None:
+        transforms.append(agent.projector)
     num_envs = cfg.env.num_envs
     env = build_env(cfg, scenario, num_envs, cfg.seed, *transforms)
     collector = Collector(
@@ -285,28 +412,16 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         agent.actor,
         frames_per_batch=cfg.collector.frames_per_env * num_envs,
         total_frames=-1,
-        init_random_frames=0 if cfg.init else cfg.warmup_frames,
+        init_random_frames=0 if cfg.init or on_policy(cfg) else cfg.warmup_frames,
         track_traj_ids=False,
         auto_register_policy_transforms=False,
     )
-    device = device_of(cfg)
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(cfg.buffer_size, device=device),
-        batch_size=cfg.batch_size,
-        generator=torch.Generator(device).manual_seed(cfg.seed),
-    )
-    buffer.append_transform(RewardScaling(0.0, cfg.reward_scale, in_keys=[("next", "reward")]))
-    if agent.projector is not None:
-        buffer.append_transform(ExecutedAction())
     trainer = Trainer(
         run=run,
         collector=collector,
-        buffer=buffer,
+        experience=build_experience(cfg, agent, scenario),
         learner=build_learner(cfg, agent.loss),
         budget=budget,
-        stored=STORED,
-        updates_per_frame=cfg.updates_per_frame,
-        warmup_frames=cfg.warmup_frames,
         record_every=cfg.record_every,
         save_every=cfg.save_every,
         save_minutes=cfg.get("save_minutes"),  # a run from before this setting has none
@@ -315,7 +430,5 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         hydra.utils.instantiate(cfg.lagrange.signal).register(trainer)
     if agent.projector is not None:
         ProjectorProgress(agent.projector).register(trainer)
-    if cfg.get("demonstrations"):
-        trainer.demonstrate = lambda: demonstrate(cfg, scenario)
     trainer.open_loggers = lambda: build_loggers(cfg, run)
     return trainer

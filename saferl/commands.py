@@ -9,6 +9,7 @@ import statistics
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import hydra
 import torch
@@ -18,7 +19,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.transforms import Transform
 
 from saferl import checkpoint
-from saferl.builders import build_env, build_trainer, load_agent
+from saferl.builders import build_env, build_trainer, complete, load_agent
 from saferl.checkpoint import CONFIG, run_config, run_folder
 from saferl.envs.intersection import Scenario
 from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver
@@ -37,6 +38,7 @@ def train(cfg: DictConfig) -> None:
     """Train, or continue a run, then test the result."""
     if cfg.resume is None:
         run = Path(HydraConfig.get().runtime.output_dir)
+        complete(cfg)
         OmegaConf.resolve(cfg)
         trainer = build_trainer(cfg, run)
         claim(run, cfg)
@@ -173,8 +175,10 @@ def on_its_own_task(cfg: DictConfig, trained: DictConfig, overrides: Sequence[st
     keys = [override.partition("=")[0].lstrip("+") for override in overrides]
     test = cfg.copy()
     OmegaConf.set_struct(test, False)
-    rate = {"policy_frequency": trained.evaluation.policy_frequency}
-    test.task = OmegaConf.merge(trained.task, TEST, rate)
+    changes = TEST | {"policy_frequency": trained.evaluation.policy_frequency}
+    test.task = OmegaConf.merge(
+        trained.task, {key: value for key, value in changes.items() if key in trained.task}
+    )
     if "env" not in keys:
         # The backend is the run's; what the backends set alike, or this one sets too, is the test's.
         shared = {k: v for k, v in cfg.env.items() if k in trained.env and k != "_target_"}
@@ -213,8 +217,8 @@ def choose_policy(
     trained = run_config(path, source)
     trained.device = cfg.device
     cfg = on_its_own_task(cfg, trained, HydraConfig.get().overrides.task)
-    rows = trained.encoder.policy.get("rows", cfg.task.rows)
-    if rows != cfg.task.rows:
+    rows = trained.encoder.policy.get("rows")
+    if rows is not None and rows != cfg.task.get("rows", rows):
         raise ValueError(
             f"task.rows must be {rows}, the number that this policy's MLP was trained with, "
             f"got {cfg.task.rows}."
@@ -223,9 +227,24 @@ def choose_policy(
     return cfg, policy, transforms if cfg.project else [], f"{trained.algo_name} ({name})"
 
 
+def describe(scenario: Any) -> dict[str, Any]:
+    """What a test's file says of its task."""
+    if not isinstance(scenario, Scenario):
+        return dataclasses.asdict(scenario)
+    return {
+        "task": scenario.task,
+        "vehicles": scenario.traffic.vehicles[1],
+        "rows": scenario.rows,
+        "scenario": scenario.scenario,
+        "traffic": dataclasses.asdict(scenario.traffic),
+        "reading": scenario.reward.reading,
+        "policy_frequency": scenario.policy_frequency,
+    }
+
+
 def measure(
     cfg: DictConfig,
-    scenario: Scenario,
+    scenario: Any,
     policy: TensorDictModuleBase,
     transforms: Sequence[Transform],
     *,
@@ -236,7 +255,6 @@ def measure(
     policy_name: str,
 ) -> list[dict]:
     """Play, write ``metrics.json`` and ``episodes.csv``, report the table; returns the rows."""
-    most = scenario.traffic.vehicles[1]
     env = build_env(cfg, scenario, envs_at_once(episodes, num_envs), seed, *transforms)
     rows = play_episodes(policy, env, episodes, seed)
     latencies: list[float] = []
@@ -248,19 +266,15 @@ def measure(
         rows,
         out,
         policy=policy_name,
-        task=scenario.task,
         env=backend,
-        vehicles=most,
-        rows=scenario.rows,
-        scenario=scenario.scenario,
-        traffic=dataclasses.asdict(scenario.traffic),
-        reading=scenario.reward.reading,
-        policy_frequency=scenario.policy_frequency,
+        **describe(scenario),
         project=bool(transforms),
         episodes=episodes,
         seed=seed,
     )
-    title = f"{policy_name}: {episodes} episodes of {scenario.task}, {most} vehicles"
+    title = f"{policy_name}: {episodes} episodes of {scenario.task}"
+    if isinstance(scenario, Scenario):
+        title += f", {scenario.traffic.vehicles[1]} vehicles"
     log.info("\n%s", table(figures, title))
     if latencies:  # in a file of its own: the others are the same each time
         took = {"median": statistics.median(latencies), "longest": max(latencies)}

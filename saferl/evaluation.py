@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from saferl.envs.intersection import Scenario
 from saferl.envs.intersection.geometry import ROUTES
-from saferl.envs.intersection.spawning import episode_seeds
+from saferl.envs.seeding import episode_seeds
 from saferl.metrics import summarise
 
 #: What a test changes in the task that a policy was trained on: every start before the box, parked
@@ -32,19 +32,22 @@ TEST: dict[str, Any] = {
 }
 
 
-def as_test(scenario: Scenario, policy_frequency: int = 10) -> Scenario:
-    """The conditions of a test: :data:`TEST`, and another rate of decisions.
+def as_test(scenario: Any, policy_frequency: int = 10) -> Any:
+    """The conditions of a test: :data:`TEST`, and another rate of decisions; a task that is no
+    :class:`Scenario` as it is.
 
     >>> as_test(Scenario(route_starts=0.5)).route_starts
     0.0
     """
+    if not isinstance(scenario, Scenario):
+        return scenario
     reward = dataclasses.replace(scenario.reward, **TEST["reward"])
     changes = TEST | {"policy_frequency": policy_frequency, "reward": reward}
     return dataclasses.replace(scenario, **changes)
 
 
 def start(env: EnvBase, seeds: Tensor) -> TensorDictBase:
-    """Reset an intersection, with or without transforms, to the episodes of these seeds.
+    """Reset an environment, with or without transforms, to the episodes of these seeds.
 
     TorchRL's ``TransformedEnv.reset`` keeps every key but the environment's state from it, so a
     ``seed`` must reach the environment itself.
@@ -70,7 +73,7 @@ def play(
 
     Args:
         policy: any module that reads the observation and writes ``action``; its mean action is used.
-        env: an intersection with batch size [B], with or without transforms.
+        env: a :class:`SeededEnv` with batch size [B], with or without transforms.
         seeds: int64 [B], the episodes to play.
         ended: told after each decision how many episodes ended with it.
 
@@ -101,13 +104,15 @@ def episode_rows(steps: list[TensorDictBase], seeds: Tensor) -> list[dict]:
     ``correction`` the mean size of such a change.
     """
 
+    after = steps[0]["next"]
+
     def over_time(key: str, dtype: torch.dtype = torch.float64) -> Tensor:
         return torch.stack([step["next", key].to(dtype).squeeze(-1) for step in steps]).cpu()
 
     alive = torch.stack([step["alive"] for step in steps]).cpu()
-    ego = over_time("ego")
-    moved = shift = torch.zeros_like(ego[..., 0])
-    if "action_executed" in steps[0]["next"]:
+    values = {"return": over_time("reward"), "cost_return": over_time("cost")}
+    moved = shift = torch.zeros_like(values["cost_return"])
+    if "action_executed" in after:
         moved = over_time("intervened")
         shift = torch.stack(
             [
@@ -115,40 +120,37 @@ def episode_rows(steps: list[TensorDictBase], seeds: Tensor) -> list[dict]:
                 for step in steps
             ]
         ).cpu()
-    values = {
-        "return": over_time("reward"),
-        "speed": torch.hypot(ego[..., 3], ego[..., 4]),
-        "cost_return": over_time("cost"),
-        "intervention_rate": moved,
-        "correction": shift,
-    }
-    ends = {key: over_time(key, torch.bool) for key in ("collision", "offroad", "success")}
+    values |= {"intervention_rate": moved, "correction": shift}
+    if "ego" in after:
+        ego = over_time("ego")
+        values["speed"] = torch.hypot(ego[..., 3], ego[..., 4])
+        ends = {key: over_time(key, torch.bool) for key in ("collision", "offroad", "success")}
+        routes = steps[0].get("route").flatten().tolist()
     rows = []
-    routes = steps[0].get("route").flatten().tolist()
-    for index, (seed, route, count) in enumerate(
-        zip(seeds.tolist(), routes, alive.sum(0).tolist(), strict=True)
-    ):
+    for index, (seed, count) in enumerate(zip(seeds.tolist(), alive.sum(0).tolist(), strict=True)):
         # Exact sums: they do not depend on how long the episodes beside this one lasted.
         total = {key: math.fsum(value[:count, index].tolist()) for key, value in values.items()}
-        hit, left, success = (bool(end[count - 1, index]) for end in ends.values())
-        rows.append(
-            {
-                "seed": seed,
-                "route": ROUTES[route],
+        row = {"seed": seed}
+        if "ego" in after:
+            hit, left, success = (bool(end[count - 1, index]) for end in ends.values())
+            row |= {
+                "route": ROUTES[routes[index]],
                 "collision": int(hit or left),
                 "success": int(success),
                 "frozen": int(not (hit or left or success)),
                 "hit_vehicle": int(hit),
                 "left_road": int(left),
-                "return": total["return"],
                 "speed": total["speed"] / count,
-                "cost_return": total["cost_return"],
-                "intervention_rate": total["intervention_rate"] / count,
-                "correction": total["correction"] / max(total["intervention_rate"], 1.0),
                 "min_distance": ego[:count, index, 7].min().item(),
-                "decisions": count,
             }
-        )
+        row |= {
+            "return": total["return"],
+            "cost_return": total["cost_return"],
+            "intervention_rate": total["intervention_rate"] / count,
+            "correction": total["correction"] / max(total["intervention_rate"], 1.0),
+            "decisions": count,
+        }
+        rows.append(row)
     return rows
 
 

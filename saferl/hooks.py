@@ -5,7 +5,7 @@ from __future__ import annotations
 from tensordict import TensorDictBase
 
 from saferl.envs.transforms import SafetyProjector
-from saferl.objectives import SACLagLoss
+from saferl.modules import LagrangeMultiplier
 from saferl.trainer import Trainer
 
 
@@ -13,16 +13,19 @@ class CriticSignal:
     """Dual ascent on Q_c(s, a) - d_thres of each update's batch (E11)."""
 
     def register(self, trainer: Trainer) -> None:
-        trainer.learner.after_update.append(self._update)
         self._lagrange = _multiplier(trainer)
+        if "constraint_violation" not in trainer.learner.loss.out_keys:
+            raise ValueError(
+                f"lagrange.signal=CriticSignal needs Q_c(s, a), which {type(trainer.learner.loss).__name__} "
+                "has not; use lagrange=episode."
+            )
+        trainer.learner.after_update.append(self._update)
 
     def _update(self, losses: TensorDictBase) -> None:
         self._lagrange.update(losses["constraint_violation"])
 
 
-def episode_budget(
-    cost_limit: float, gamma: float, duration: float, policy_frequency: float
-) -> float:
+def episode_budget(cost_limit: float, gamma: float, horizon: float) -> float:
     """The mean undiscounted cost b of an episode whose discounted form is ``cost_limit`` d.
 
     Cost spread evenly over T decisions: d = b (1 - gamma^T) / ((1 - gamma) T).
@@ -30,13 +33,11 @@ def episode_budget(
     Args:
         cost_limit: d_thres.
         gamma: discount in [0, 1].
-        duration: of an episode, seconds.
-        policy_frequency: decisions per second.
+        horizon: T, decisions of an episode.
 
-    >>> round(episode_budget(0.05, gamma=0.99, duration=25.0, policy_frequency=5), 4)
+    >>> round(episode_budget(0.05, gamma=0.99, horizon=125), 4)
     0.0874
     """
-    horizon = duration * policy_frequency
     weight = horizon if gamma == 1.0 else (1.0 - gamma**horizon) / (1.0 - gamma)
     return cost_limit * horizon / weight
 
@@ -79,10 +80,12 @@ class ProjectorProgress:
         trainer.after_collect.append(lambda _, spent: self.projector.set_progress(spent))
 
 
-def _multiplier(trainer: Trainer):
+def _multiplier(trainer: Trainer) -> LagrangeMultiplier:
     loss = trainer.learner.loss
-    if not isinstance(loss, SACLagLoss):
+    multiplier = getattr(loss, "lagrange", None)
+    if not isinstance(multiplier, LagrangeMultiplier):
         raise ValueError(
-            f"lagrange.signal needs a loss with a multiplier (loss=sac_lag), got {type(loss).__name__}."
+            "lagrange.signal needs a loss with a multiplier (loss=sac_lag or ppo_lag), "
+            f"got {type(loss).__name__}."
         )
-    return loss.lagrange
+    return multiplier

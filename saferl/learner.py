@@ -26,7 +26,7 @@ class Learner:
         loss: any TorchRL LossModule.
         optimizer: over the loss's parameters; each group holds ``schedule``, its (first, last)
             learning rate, linear in the fraction of the budget that is spent.
-        target_updater: soft update of the loss's targets.
+        target_updater: soft update of the loss's targets; None where it has none.
         after_update: called with the loss's output after each step (a multiplier, for example).
         order: ``"joint"``: every term at the same parameters, then one step of all, as TorchRL's
             losses do. ``"sequential"`` (paper, Algorithm 1): critics, actor and temperature in turn,
@@ -43,7 +43,7 @@ class Learner:
         self,
         loss: LossModule,
         optimizer: torch.optim.Optimizer,
-        target_updater: SoftUpdate,
+        target_updater: SoftUpdate | None = None,
         after_update: list[Callable[[TensorDictBase], None]] | None = None,
         order: str = "joint",
         compile: Callable[[LossModule], Callable] | None = None,
@@ -74,7 +74,8 @@ class Learner:
             torch.stack(terms).sum().backward(inputs=list(chain(*groups)))
             self.optimizer.step()
             self.optimizer.zero_grad(set_to_none=True)
-        self.target_updater.step()
+        if self.target_updater is not None:
+            self.target_updater.step()
         for hook in self.after_update:
             hook(losses)
         return losses.detach()

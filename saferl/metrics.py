@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -29,27 +28,28 @@ def finished_episodes(data: TensorDictBase) -> TensorDict:
 
     Args:
         data: [*B, T] transitions with ``("next", ...)`` ``done``, ``episode_reward``,
-            ``episode_cost`` (TorchRL's RewardSum) and the outcomes ``collision``, ``offroad``,
-            ``success``.
+            ``episode_cost`` (TorchRL's RewardSum) and, on the road, the outcomes ``collision``,
+            ``offroad``, ``success``.
 
     Returns:
-        [n] TensorDict of float ``return``, ``cost_return``, ``collision`` (with a vehicle or off the
-        road), ``success`` and ``frozen``.
+        [n] TensorDict of float ``return``, ``cost_return`` and, on the road, ``collision`` (with a vehicle or
+        off the road), ``success`` and ``frozen``.
     """
     after = data.get("next")
     ends = after[after["done"].squeeze(-1)]
-    collision = (ends["collision"] | ends["offroad"]).squeeze(-1).float()
-    success = ends["success"].squeeze(-1).float()
-    return TensorDict(
-        {
-            "return": ends["episode_reward"].squeeze(-1),
-            "cost_return": ends["episode_cost"].squeeze(-1),
+    figures = {
+        "return": ends["episode_reward"].squeeze(-1),
+        "cost_return": ends["episode_cost"].squeeze(-1),
+    }
+    if "collision" in after.keys():  # noqa: SIM118
+        collision = (ends["collision"] | ends["offroad"]).squeeze(-1).float()
+        success = ends["success"].squeeze(-1).float()
+        figures |= {
             "collision": collision,
             "success": success,
             "frozen": 1.0 - collision - success,
-        },
-        batch_size=ends.batch_size[:1],
-    )
+        }
+    return TensorDict(figures, batch_size=ends.batch_size[:1])
 
 
 class EpisodeWindow:
@@ -65,42 +65,39 @@ class EpisodeWindow:
     {}
     """
 
-    KEYS = ("return", "cost_return", "collision", "success", "frozen")
-
     def __init__(self, length: int = 200):
         self.length = length
-        self.values = torch.zeros(0, len(self.KEYS))
+        self.values: dict[str, torch.Tensor] = {}
 
     def extend(self, data: TensorDictBase) -> TensorDict:
         """Take collected data [*B, T]; returns its finished episodes [n]."""
         episodes = finished_episodes(data)
-        rows = torch.stack([episodes[key] for key in self.KEYS], -1).cpu()
-        self.values = torch.cat([self.values, rows])[-self.length :]
+        for key, new in episodes.items():
+            old = self.values.get(str(key), torch.zeros(0))
+            self.values[str(key)] = torch.cat([old, new.cpu()])[-self.length :]
         return episodes
 
     def summary(self) -> dict[str, float]:
         """Mean return, cost return and rates of the window; NaN before the first episode."""
-        means = self.values.mean(0).tolist() if len(self.values) else [math.nan] * len(self.KEYS)
-        names = ("return", "cost_return", "collision_rate", "success_rate", "frozen_rate")
-        return {name: round(mean, 6) for name, mean in zip(names, means, strict=True)}
+        return {
+            f"{key}_rate" if f"{key}_rate" in FIGURES else key: round(float(value.mean()), 6)
+            for key, value in self.values.items()
+        }
 
     def short(self) -> dict[str, str]:
         """The summary for a progress bar; empty before the first episode."""
-        if not len(self.values):
+        if not any(map(len, self.values.values())):
             return {}
         figures = self.summary()
-        return {
-            "return": f"{figures['return']:.1f}",
-            "cost": f"{figures['cost_return']:.3f}",
-            "CR": f"{figures['collision_rate']:.0%}",
-            "SR": f"{figures['success_rate']:.0%}",
-        }
+        bar = {"return": f"{figures['return']:.1f}", "cost": f"{figures['cost_return']:.3f}"}
+        rates = {"CR": "collision_rate", "SR": "success_rate"}
+        return bar | {name: f"{figures[key]:.0%}" for name, key in rates.items() if key in figures}
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        return {"values": self.values}
+        return dict(self.values)
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        self.values = state["values"].clone()
+        self.values = {key: value.clone() for key, value in state.items()}
 
 
 class CsvLog:
@@ -162,8 +159,8 @@ def summarise(rows: Sequence[dict[str, float]]) -> dict[str, dict[str, float]]:
     """Mean and 95% interval of each figure over episodes.
 
     Args:
-        rows: one dict an episode with ``collision``, ``success``, ``frozen`` (0 or 1), ``return``,
-            ``speed``, ``cost_return`` and ``intervention_rate`` (share of its decisions).
+        rows: one dict an episode with ``return``, ``cost_return``, ``intervention_rate`` (share of its
+            decisions) and, on the road, ``collision``, ``success``, ``frozen`` (0 or 1) and ``speed``.
 
     Returns:
         ``{figure: {"mean", "low", "high"}}``; Wilson's interval for rates of episodes, Student's t
@@ -176,7 +173,10 @@ def summarise(rows: Sequence[dict[str, float]]) -> dict[str, dict[str, float]]:
         raise ValueError("summarise needs at least one episode, got none.")
     figures = {}
     for name, (_, is_rate) in FIGURES.items():
-        values = [float(row[name.removesuffix("_rate") if is_rate else name]) for row in rows]
+        column = name.removesuffix("_rate") if is_rate else name
+        if column not in rows[0]:
+            continue
+        values = [float(row[column]) for row in rows]
         low, high = wilson(round(sum(values)), len(values)) if is_rate else mean_interval(values)
         if name.endswith("_rate"):
             low, high = max(low, 0.0), min(high, 1.0)
@@ -188,8 +188,8 @@ def table(figures: dict[str, dict[str, float]], title: str = "") -> str:
     """A plain-text table of :func:`summarise`'s figures; rates in percent."""
     lines = [title] if title else []
     lines.append(f"{'':<14}{'mean':>10}   95% interval")
-    for name, (short, _) in FIGURES.items():
-        value, scale = figures[name], 100.0 if name.endswith("_rate") else 1.0
+    for name, value in figures.items():
+        short, scale = FIGURES[name][0], 100.0 if name.endswith("_rate") else 1.0
         unit = " %" if scale == 100.0 else ""
         mean, low, high = (value[key] * scale for key in ("mean", "low", "high"))
         lines.append(f"{short:<14}{mean:>10.2f}{unit:<2} [{low:.2f}, {high:.2f}]{unit}")

@@ -19,6 +19,20 @@ OmegaConf.register_new_resolver(
     "when", lambda given, value: None if given is None else value, replace=True
 )
 
+# ${unless:a,b} is b where a is null, else null.
+OmegaConf.register_new_resolver(
+    "unless", lambda given, value: value if given is None else None, replace=True
+)
+# ${ceil_div:a,b} is a / b, rounded up.
+OmegaConf.register_new_resolver("ceil_div", lambda a, b: -(-a // b), replace=True)
+
+# ${decisions:${task}}: how many an episode has at most.
+OmegaConf.register_new_resolver(
+    "decisions",
+    lambda task: task["horizon"] if "horizon" in task else task.duration * task.policy_frequency,
+    replace=True,
+)
+
 PACKAGE = Path(__file__).resolve().parent
 #: A budget for which compiling pays, which takes minutes.
 LONG = {"episodes": 2_000, "frames": 100_000}

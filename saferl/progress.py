@@ -47,7 +47,6 @@ class Progress:
     frames: int = 0
     episodes: int = 0
     updates: int = 0
-    owed: float = 0.0
     last_record: int = 0
     last_save: int = -1
 

@@ -11,22 +11,33 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, Protocol
 
 from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.collectors import Collector
-from torchrl.data import ReplayBuffer
 from torchrl.record.loggers import Logger
 from tqdm import tqdm
 
 from saferl.checkpoint import RunCheckpoint
-from saferl.components import BufferState, CollectorState, Fitting, GrowingFiles
+from saferl.components import CollectorState, Fitting, GrowingFiles
 from saferl.learner import Learner
 from saferl.metrics import CsvLog, EpisodeWindow
 from saferl.progress import Budget, Clock, Progress
 
 log = logging.getLogger(__name__)
+
+
+class Experience(Protocol):
+    """What the trainer asks of :mod:`saferl.experience`."""
+
+    def prepare(self) -> None: ...
+
+    def batches(self, data: TensorDictBase, frames: int) -> Iterator[TensorDictBase]: ...
+
+    def state_dict(self) -> dict[str, Any]: ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None: ...
 
 
 @contextmanager
@@ -59,19 +70,14 @@ class Trainer:
     Attributes:
         run: folder of the run's files.
         collector: yields [B, T] batches of transitions.
-        buffer: replay buffer; its transforms decide what is stored and what is sampled.
-        learner: makes one update from a sampled batch.
+        experience: takes each batch, and gives what the learner updates from.
+        learner: makes one update from what it is given.
         budget: how long.
-        stored: keys of a transition that the buffer keeps, where they exist.
-        updates_per_frame: gradient updates for each collected frame.
-        warmup_frames: collected before the first update.
         record_every: frames between two rows of ``metrics.csv``.
         save_every: frames between two checkpoints.
         save_minutes: of wall-clock, after which a checkpoint is due all the same; None: never.
         after_collect: called with each batch's finished episodes (a TensorDict of per-episode
             ``return``, ``cost_return`` and outcomes, [n]) and the fraction of the budget spent.
-        demonstrate: gives transitions [N] that the buffer holds before the first frame, or None; they
-            count as no frames.
         open_loggers: makes the TorchRL loggers that receive the scalars of each row; called when
             training starts.
         window: means over the last episodes.
@@ -79,29 +85,20 @@ class Trainer:
 
     run: Path
     collector: Collector
-    buffer: ReplayBuffer
+    experience: Experience
     learner: Learner
     budget: Budget
-    stored: Sequence[NestedKey]
-    updates_per_frame: float = 0.25
-    warmup_frames: int = 1000
     record_every: int = 2000
     save_every: int = 50_000
     save_minutes: float | None = 5.0
     window: EpisodeWindow = field(default_factory=EpisodeWindow)
     after_collect: list[Callable[[TensorDictBase, float], None]] = field(default_factory=list)
-    demonstrate: Callable[[], TensorDictBase] | None = None
     open_loggers: Callable[[], Sequence[Logger]] = list
 
     def __post_init__(self):
-        for name, least in (
-            ("updates_per_frame", 0),
-            ("warmup_frames", 1),
-            ("record_every", 1),
-            ("save_every", 1),
-        ):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} must be >= {least}, got {getattr(self, name)}.")
+        for name in ("record_every", "save_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be >= 1, got {getattr(self, name)}.")
         if self.save_minutes is not None and not self.save_minutes > 0:
             raise ValueError(f"save_minutes must be null or > 0, got {self.save_minutes}.")
         self.progress, self.clock = Progress(), Clock()
@@ -115,7 +112,7 @@ class Trainer:
             self.run,
             loss=Fitting(self.learner.loss),
             optimizer=self.learner.optimizer,
-            buffer=BufferState(self.buffer),
+            buffer=self.experience,
             collector=CollectorState(self.collector),
             progress=self.progress,
             clock=self.clock,
@@ -166,8 +163,7 @@ class Trainer:
         batches = iter(self.collector)
         with self._logging(), _interrupts() as interrupted, bar:
             if progress.last_save < 0:
-                if self.demonstrate is not None:
-                    self._store(self.demonstrate())
+                self.experience.prepare()
                 self.save()
             while self.spent < 1.0 and not interrupted:
                 with self.clock.phase("collect"):
@@ -228,27 +224,19 @@ class Trainer:
         self._saved_at = time.monotonic()
 
     def _take(self, data: TensorDictBase) -> TensorDict:
-        """Store a batch and make the updates it entitles to; returns its finished episodes [n]."""
+        """Make the updates that a batch entitles to; returns its finished episodes [n]."""
         progress = self.progress
         finished = self.window.extend(data)
         progress.frames += data.numel()
         progress.episodes += finished.shape[0]
-        self._store(data)
         for hook in self.after_collect:
             hook(finished, self.spent)
-        if progress.frames < self.warmup_frames:
-            return finished
         with self.clock.phase("learn"):
             self.learner.schedule(self.spent)
-            progress.owed += data.numel() * self.updates_per_frame
-            while progress.owed >= 1.0:
-                progress.owed -= 1.0
+            for batch in self.experience.batches(data, progress.frames):
                 progress.updates += 1
-                self._add(self.learner.update(self.buffer.sample()))
+                self._add(self.learner.update(batch))
         return finished
-
-    def _store(self, data: TensorDictBase) -> None:
-        self.buffer.extend(data.select(*self.stored, strict=False).contiguous().reshape(-1))
 
     def _add(self, losses: TensorDictBase) -> None:
         for key, value in losses.items():

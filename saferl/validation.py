@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import NoneType, UnionType
@@ -26,13 +26,16 @@ TRAINING = {
     "episodes": (int | None, 1, math.inf),
     "frames": (int | None, 1, math.inf),
     "gamma": (float, 0, 1),
+    "gae_lambda": (float, 0, 1),
     "cost_limit": (float, 0, math.inf),
     "cost_target": (Literal["max", "mean"], 0, 0),
+    "cost_backup": (Literal["sum", "reach"], 0, 0),
     "batch_size": (int, 1, math.inf),
     "buffer_size": (int, 1, math.inf),
     "warmup_frames": (int, 1, math.inf),
     "demonstrations": (int, 0, math.inf),
     "updates_per_frame": (float, 0, math.inf),
+    "rollout_frames": (int, 1, math.inf),
     "update_order": (Literal["joint", "sequential"], 0, 0),
     "reward_scale": (float, 0, math.inf),
     "tau": (float, 0, 1),
@@ -138,6 +141,7 @@ def check_keys(cfg: DictConfig) -> None:
 
 def _check_like(node: DictConfig, files: list, prefix: str, known: set | None = None) -> None:
     """Refuse keys that none of the files has, and plain values where they have mappings."""
+    files = [OmegaConf.to_container(file, resolve=False) for file in files]
     known = known or {key for file in files for key in file}
     for key, value in node.items():
         if key not in known:
@@ -145,9 +149,9 @@ def _check_like(node: DictConfig, files: list, prefix: str, known: set | None = 
                 f"unknown key {prefix}{key!s}; choose from {', '.join(sorted(map(str, known)))}."
             )
         like = {type(file[key]): file[key] for file in files if key in file}
-        if DictConfig in like and type(value) not in like:
+        if dict in like and not isinstance(value, DictConfig) and type(value) not in like:
             raise ValueError(
-                f"{prefix}{key!s} must be a mapping of {', '.join(like[DictConfig])}, got {value!r}."
+                f"{prefix}{key!s} must be a mapping of {', '.join(like[dict])}, got {value!r}."
             )
 
 
@@ -224,6 +228,8 @@ def fits(value: Any, kind: Any) -> bool:
         if origin is tuple and Ellipsis not in inner and listed and len(value) != len(inner):
             return False
         return listed and all(fits(item, inner[0]) for item in value)
+    if origin is Callable:
+        return callable(value)
     return not is_dataclass(kind)
 
 
@@ -241,6 +247,8 @@ def describe(kind: Any) -> str:
         inner = get_args(kind)
         size = f" of {len(inner)}" if get_origin(kind) is tuple and Ellipsis not in inner else ""
         return f"a list{size}, each {describe(inner[0])}"
+    if get_origin(kind) is Callable:
+        return "a function, by its _target_"
     if is_dataclass(kind):
         return f"a mapping of {', '.join(field.name for field in fields(kind))}"
     return _KINDS.get(kind, str(kind))

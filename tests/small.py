@@ -15,6 +15,7 @@ SMALL = (
     "batch_size=8",
     "buffer_size=64",
     "updates_per_frame=0.5",
+    "rollout_frames=8",
     "record_every=8",
     "encoder.policy.width=16",
     "evaluation.episodes=1",

@@ -20,10 +20,10 @@ from saferl.trainer import _interrupts
 TRAIN, TEST, EXPORT = ("train", "config"), ("evaluate", "evaluate"), ("export", "export")
 
 MISTAKES = [
-    (TRAIN, "algo=foo", "algo must be one of arsac, asac, rsac, sac, sac_lag, sac_rs, got 'foo'"),
-    (TRAIN, "task=foo", "task must be one of gs, lt, mixed, rt, got 'foo'"),
-    (TRAIN, "encoder=foo", "encoder must be one of mlp, mmam, got 'foo'"),
-    (TRAIN, "env=foo", "env must be one of batched, highway, got 'foo'"),
+    (TRAIN, "algo=foo", "algo must be one of arsac, arsac_signed, asac, cpo, ppo, "),
+    (TRAIN, "task=foo", "task must be one of cart, gs, gym, lt, mixed, rt, got 'foo'"),
+    (TRAIN, "encoder=foo", "encoder must be one of mlp, mlp_tanh, mmam, got 'foo'"),
+    (TRAIN, "env=foo", "env must be one of batched, cart, gym, highway, got 'foo'"),
     (TRAIN, "experiment=foo", "quickstart"),
     (TRAIN, "gama=0.9", "unknown key 'gama' (did you mean gamma?); choose from seed, "),
     (
@@ -41,7 +41,7 @@ MISTAKES = [
     (TRAIN, "cost_limit=-1", "cost_limit must be a number, >= 0, got -1"),
     (TRAIN, "episodes=0", "episodes must be a whole number or null, >= 1, got 0"),
     (TRAIN, "episodes=null", "Give one budget, episodes or frames"),
-    (TRAIN, "frames=10", "Give one budget, episodes or frames"),
+    (TRAIN, "episodes=5 frames=10", "Give one budget, episodes or frames"),
     (TRAIN, "device=foo", "device must be one of auto, cpu, cuda, got 'foo'"),
     (TRAIN, "seed=-1", "seed must be a whole number, >= 0 and <= 2147483647, got -1"),
     (TRAIN, "lr.actor=0.1", "lr.actor must be [first, last], both >= 0, got 0.1"),
@@ -75,8 +75,8 @@ MISTAKES = [
     (TEST, "pretrained=foo", "pretrained"),
     (TEST, "checkpoint=missing", "checkpoint: no such file or folder: missing"),
     (TEST, "policy=blind episodes=0", "episodes must be a whole number, >= 1, got 0"),
-    (TEST, "policy=blind task=foo", "task must be one of gs, lt, mixed, rt, got 'foo'"),
-    (TEST, "policy=blind foo=1", "unknown key 'foo'; choose from task, env, checkpoint"),
+    (TEST, "policy=blind task=foo", "task must be one of cart, gs, gym, lt, mixed, rt, got 'foo'"),
+    (TEST, "policy=blind foo=1", "unknown key 'foo'; choose from env, task, checkpoint"),
     (TEST, "policy=blind out=", "out must be a path, got ''"),
     (TEST, "checkpoint=", "checkpoint must be a path, got ''"),
     (EXPORT, "", "checkpoint=... is missing"),
@@ -216,7 +216,7 @@ def test_help_lists_groups_and_settings(command, capsys):
     assert not left.value.code
     text = capsys.readouterr().out
     assert "python -m saferl algo=arsac task=gs" in text
-    assert "algo: arsac, asac, rsac, sac, sac_lag, sac_rs" in text and "gamma: 0.99" in text
+    assert "algo: arsac, arsac_signed, asac, cpo, ppo" in text and "gamma: 0.99" in text
 
 
 def test_the_readmes_everyday_commands_work_in_order(command, tmp_path: Path):
@@ -253,7 +253,7 @@ def test_interrupt_leaves_a_checkpoint_that_loads(spawn, tmp_path: Path):
     trainer = build_trainer(compose(*options[:-1]), tmp_path / "run")
     trainer.resume()
     assert trainer.progress.updates > 0 and trainer.progress.frames >= 16
-    assert len(trainer.buffer) == min(64, trainer.progress.frames)
+    assert len(trainer.experience.buffer) == min(64, trainer.progress.frames)
 
 
 def test_interrupt_of_the_closing_test_tells_how_to_repeat_it(command, monkeypatch, capsys):

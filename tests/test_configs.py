@@ -21,6 +21,8 @@ OPTIONS = sorted(
     if path.parent.name != "hydra"
 )
 ALGOS = sorted(path.stem for path in (ROOT / "algo").glob("*.yaml"))
+#: What an option needs beside it.
+BESIDE = {"task=gym": ("task.id=Pendulum-v1", "task.cost_key=null")}
 #: Encoder, cost critics, multiplier's signal, projector, r_safe: the table of the paper.
 PARTS = {
     "arsac": (MMAMPolicyEncoder, 2, "CriticSignal", True, False),
@@ -35,10 +37,13 @@ PARTS = {
 @pytest.mark.parametrize("option", OPTIONS)
 def test_option_composes_and_is_checked(option: str):
     """Each option, with the parts that it needs beside it, passes the check of what it says."""
-    check_training(compose(option))
+    check_training(compose(option, *BESIDE.get(option, ())))
 
 
-@pytest.mark.parametrize("option", [o for o in OPTIONS if o.startswith(("task=", "env="))])
+ROADS = {"task": ["gs", "lt", "mixed", "rt"], "env": ["batched", "highway"]}
+
+
+@pytest.mark.parametrize("option", [f"{group}={name}" for group in ROADS for name in ROADS[group]])
 def test_option_of_the_evaluation(option: str):
     cfg = compose(option, config="evaluate")
     check_testing(cfg)
@@ -49,26 +54,47 @@ def test_option_of_the_evaluation(option: str):
 
 def test_help_of_the_evaluation_lists_its_choices():
     template = OmegaConf.load(ROOT / "evaluate.yaml").hydra.help.template
-    for group in ("task", "env"):
-        choices = ", ".join(sorted(path.stem for path in (ROOT / group).glob("*.yaml")))
-        assert f"{group}: {choices}\n" in template
+    for group, choices in ROADS.items():
+        assert f"{group}: {', '.join(choices)}\n" in template
 
 
 def test_every_file_is_an_option_of_a_known_group():
     groups = {path.name for path in ROOT.iterdir() if path.is_dir()}
     assert groups == {
-        "algo", "collector", "cost_critic", "critic", "encoder", "env", "experiment", "hydra",
-        "lagrange", "logger", "loss", "projector", "shaping", "task",
+        "algo", "collector", "cost_critic", "critic", "encoder", "env", "experience",
+        "experiment", "hydra",
+        "lagrange", "logger", "loss", "projector", "risk", "shaping", "task",
     }  # fmt: skip
     assert not list(ROOT.rglob("__init__.py"))  # a package of YAML would be shipped as code
     assert set(ALGOS) >= set(PARTS)
 
 
+#: Ways to compose a task with its environment, small.
+TASKS = {
+    "batched": ("task=mixed", "env=batched", "task.vehicles=0"),
+    "highway": ("task=gs", "env=highway", "task.vehicles=3"),
+    "cart": ("task=cart",),
+    "gym": ("task=gym", *BESIDE["task=gym"]),
+}
+
+
+@pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("algo", ALGOS)
-@pytest.mark.parametrize("env", ["highway", "batched"])
-def test_algorithm_builds_and_makes_updates(algo: str, env: str, tmp_path: Path):
-    vehicles = 3 if env == "highway" else 0
-    cfg = compose(*SMALL, f"algo={algo}", f"env={env}", f"task.vehicles={vehicles}", "frames=12")
+def test_algorithm_builds_and_makes_updates(algo: str, task: str, tmp_path: Path):
+    """On every kind of task, or it is refused with the reason."""
+    options = (f"algo={algo}", *TASKS[task], "frames=12")
+    cfg = compose(*SMALL, *options)
+    if task in ("cart", "gym"):
+        if cfg.task.get("reward"):
+            with pytest.raises(ValueError, match=r"unknown key task.reward: .* takes"):
+                build_trainer(cfg, tmp_path)
+            return
+        if cfg.encoder.policy._target_.endswith("MMAMPolicyEncoder"):
+            with pytest.raises(
+                ValueError, match="reads ego, vehicles, but task=.* set encoder=mlp"
+            ):
+                build_trainer(cfg, tmp_path)
+            return
     trainer = build_trainer(cfg, tmp_path)
     trainer.train()
     assert trainer.progress.frames >= 12 and trainer.progress.updates >= 2
@@ -109,10 +135,14 @@ def test_cost_limit_sets_the_episode_budget_of_sac_lag(options, limit: float):
 
 
 @pytest.mark.parametrize("option", [o for o in OPTIONS if o.startswith("experiment=")])
-@pytest.mark.parametrize("algo", ["arsac", "sac"])
+@pytest.mark.parametrize("algo", ["arsac", "rsac", "sac", "cpo"])
 def test_preset_builds_with_either_kind_of_algorithm(option: str, algo: str, tmp_path: Path):
     fast = ("encoder.policy.width=16", "logger=none", "compile=false", "threads=1")
     cfg = compose(option, f"algo={algo}", *fast)
+    if option == "experiment=cart" and algo == "arsac":
+        with pytest.raises(ValueError, match="set encoder=mlp"):
+            build_trainer(cfg, tmp_path)
+        return
     build_trainer(cfg, tmp_path)
 
 

@@ -26,7 +26,7 @@ from saferl.envs.intersection import (
     Scenario,
 )
 from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver
-from saferl.envs.intersection.spawning import episode_seeds
+from saferl.envs.seeding import episode_seeds
 from saferl.envs.transforms import SafetyProjector
 from saferl.evaluation import as_test, evaluate, write
 from saferl.metrics import FIGURES
@@ -153,7 +153,7 @@ def test_write(tmp_path: Path):
 
 
 def test_a_runs_closing_test_is_the_evaluation_of_its_checkpoint(tmp_path: Path, command):
-    """Training and testing agree (a peer's did not, PEERS 11): same policy, episodes and figures,
+    """Training and testing agree (a peer's did not, docs/pitfalls.md, 11): same policy, episodes and figures,
     on the run's own task, whose reward is not the default one here."""
     task = (*EMPTY, "task=rt", "task.duration=2", "task.rows=4")
     algo = ("algo=rsac", "projector.steps=5", "experiment=paper")

@@ -44,7 +44,7 @@ def imports(name: str) -> set[str]:
 
 
 #: What a command line reaches: these alone may put concrete parts together.
-COMMANDS = {"__main__", "cli", "commands", "evaluate", "export"}
+COMMANDS = {"__main__", "catalog", "cli", "commands", "evaluate", "export"}
 GRAPH = {name: imports(name) for name in MODULES}
 
 

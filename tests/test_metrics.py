@@ -93,12 +93,15 @@ def test_finished_episodes_and_window():
     assert episodes["frozen"].tolist() == [0, 0, 1]
 
     window = EpisodeWindow(length=2)
+    assert window.summary() == {} and not window.short()
+    window.extend(collected([[False]]))
     assert all(math.isnan(value) for value in window.summary().values()) and not window.short()
+    assert "success_rate" in window.summary()
     assert len(window.extend(data)) == 3
     assert window.summary()["return"] == 11.0  # the last two
     assert window.summary()["frozen_rate"] == window.summary()["collision_rate"] == 0.5
     assert window.short() == {"return": "11.0", "cost": "0.110", "CR": "50%", "SR": "0%"}
-    assert len(window.extend(collected([[False]]))) == 0  # no episode ended (PEERS 10)
+    assert len(window.extend(collected([[False]]))) == 0  # no episode ended (docs/pitfalls.md, 10)
     assert window.summary()["return"] == 11.0
 
 

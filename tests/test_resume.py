@@ -74,16 +74,22 @@ def test_killed_and_resumed_equals_uninterrupted(algo: str, tmp_path: Path, spaw
     one, other = (restored(tmp_path / name, *options) for name in ("whole", "killed"))
     assert one.progress.frames == 48 and one.progress.updates > 10
     assert_same(everything(one), everything(other))
-    assert len(one.buffer) == 48  # a true buffer was compared
+    assert len(one.experience.buffer) == 48  # a true buffer was compared
     if algo == "arsac":
-        rows = one.buffer[:]
+        rows = one.experience.buffer[:]
         assert (rows["action"] != rows["action_proposed"]).any()
     for name in ("metrics.csv", "evaluation/episodes.csv", "evaluation/metrics.json"):
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "killed" / name).read_bytes()
 
 
 @pytest.mark.parametrize(
-    ("algo", "vehicles", "scenario"), [("sac_lag", 0, "nominal"), ("rsac", 5, "dense")]
+    ("algo", "vehicles", "scenario"),
+    [
+        ("sac_lag", 0, "nominal"),
+        ("rsac", 5, "dense"),
+        ("ppo_lag", 0, "dense"),
+        ("cpo", 0, "nominal"),
+    ],
 )
 def test_every_later_step_is_the_same(algo: str, vehicles: int, scenario: str, tmp_path: Path):
     """In one process: the state after a resume equals the state that was saved, and so does each
@@ -154,9 +160,9 @@ def test_a_run_killed_before_its_first_episode_can_be_resumed(tmp_path: Path):
     trainer = build_trainer(compose(*options), tmp_path)
     trainer.save()
     copy = restored(tmp_path, *options)
-    assert copy.progress.frames == 0 and len(copy.buffer) == 0
+    assert copy.progress.frames == 0 and len(copy.experience.buffer) == 0
     copy.train()
-    assert copy.progress.frames == 24 and isinstance(copy.buffer[:], TensorDict)
+    assert copy.progress.frames == 24 and isinstance(copy.experience.buffer[:], TensorDict)
 
 
 def test_a_checkpoint_by_the_clock_changes_nothing(tmp_path: Path):

@@ -24,6 +24,7 @@ from saferl.builders import STORED, build_trainer
 from saferl.checkpoint import CONFIG
 from saferl.envs.intersection import BatchedIntersection, Scenario
 from saferl.envs.intersection.drivers import CautiousDriver, Driver
+from saferl.experience import Epochs, Replay
 from saferl.hooks import CriticSignal, EpisodeSignal, episode_budget
 from saferl.metrics import EpisodeWindow
 from saferl.paths import config_dir
@@ -55,7 +56,7 @@ def test_budget():
 
 
 def test_random_warm_up_differs_between_environments(tmp_path: Path):
-    """A peer drew one action for all (PEERS 1)."""
+    """A peer drew one action for all (docs/pitfalls.md, 1)."""
     trainer = trainer_of(tmp_path, "env.num_envs=6", "algo=sac")
     action = collect(trainer, 1)[0]["action"]
     assert len(action.reshape(-1, 2).unique(dim=0)) == 6
@@ -65,7 +66,7 @@ def test_random_warm_up_differs_between_environments(tmp_path: Path):
 def test_demonstrations_fill_the_buffer_before_the_first_frame(tmp_path: Path):
     options = ("algo=arsac", "demonstrations=101", "buffer_size=200", "episodes=null", "frames=8")
     trainer = build_trainer(compose(*SMALL, *options, "env.num_envs=2"), tmp_path)
-    trainer.demonstrate, shown = None, trainer.demonstrate()
+    shown = trainer.experience.demonstrate()
     assert 101 <= len(shown) < 101 + 2 * trainer.collector.env.batch_size[0]
     # The mean error of the noise alone is 0.16.
     for half, driver in zip(
@@ -73,19 +74,20 @@ def test_demonstrations_fill_the_buffer_before_the_first_frame(tmp_path: Path):
     ):
         error = half["action"] - driver(half.clone())["action"]
         assert 0.1 < error.abs().mean() < 0.18
-    trainer.demonstrate = lambda: shown
+    trainer.experience.demonstrate = lambda: shown
     trainer.train()
-    stored = trainer.buffer[:]
+    stored = trainer.experience.buffer[:]
     assert len(stored) == len(shown) + 8 and trainer.progress.frames == 8
     for key in ("action", ("next", "cost"), ("next", "ego")):
         assert torch.equal(stored[key][: len(shown)], shown[key])
 
 
-def test_threads_are_one_unless_asked_for(tmp_path: Path):
-    """PEERS 14."""
-    torch.set_num_threads(2)
-    trainer_of(tmp_path, "algo=sac")
-    assert torch.get_num_threads() == 1
+def test_threads_are_as_many_as_are_asked_for(tmp_path: Path):
+    """Two by default, not all that a machine has (docs/pitfalls.md, 14)."""
+    assert compose().threads == 2
+    for threads in (2, 1):
+        trainer_of(tmp_path, "algo=sac", f"threads={threads}")
+        assert torch.get_num_threads() == threads
 
 
 def test_updates_follow_the_frames(tmp_path: Path):
@@ -131,7 +133,7 @@ def test_an_update_moves_everything_that_learns(tmp_path: Path):
 
 def costly(trainer: Trainer) -> TensorDict:
     """A batch with a cost, of which an empty road has none."""
-    batch = trainer.buffer.sample()
+    batch = trainer.experience.buffer.sample()
     return batch.set(("next", "cost"), torch.rand(batch["next", "cost"].shape))
 
 
@@ -165,20 +167,20 @@ def test_buffer_keeps_the_executed_action_and_unscaled_reward(tmp_path: Path):
     trainer = trainer_of(tmp_path, "algo=rsac", "cost_limit=0", "reward_scale=0.1")
     always_risky(trainer)
     data = torch.cat([each.reshape(-1) for each in collect(trainer, 3)])
-    rows = trainer.buffer.storage[:6]
+    rows = trainer.experience.buffer.storage[:6]
     assert torch.equal(rows["action"], data["next", "action_executed"])
     assert torch.equal(rows["action_proposed"], data["action"])
     assert (rows["action"] != rows["action_proposed"]).any()
     assert torch.equal(rows["next", "reward"], data["next", "reward"])
-    sample = trainer.buffer.sample()
+    sample = trainer.experience.buffer.sample()
     stored = rows["next", "reward"][sample["index"].flatten()]
     torch.testing.assert_close(sample["next", "reward"], 0.1 * stored)
 
 
 @pytest.mark.parametrize("late", [0, 1])
 def test_an_end_on_the_last_step_does_not_bootstrap(late: int):
-    """Success on the very step of the time limit is stored as terminated (PEERS 2); one step less
-    and it is truncated alone, which the environment's own flag says (PEERS 12)."""
+    """Success on the very step of the time limit is stored as terminated (docs/pitfalls.md, 2); one step less
+    and it is truncated alone, which the environment's own flag says (docs/pitfalls.md, 12)."""
     free = BatchedIntersection(Scenario(task="rt", vehicles=0), num_envs=1, seed=3)
     steps = free.rollout(125, Driver()).shape[-1]
     scenario = Scenario(task="rt", vehicles=0, duration=(steps - late) / 5)
@@ -203,7 +205,7 @@ def test_an_end_on_the_last_step_does_not_bootstrap(late: int):
 
 
 def test_episode_signal_uses_each_fresh_episode_once(tmp_path: Path):
-    """Not a stale mean at every gradient step (PEERS 5), nothing where none ended (PEERS 10)."""
+    """Not a stale mean at every gradient step (docs/pitfalls.md, 5), nothing where none ended (docs/pitfalls.md, 10)."""
     trainer = trainer_of(
         tmp_path, "algo=sac_lag", "task.duration=1", "frames=200", "lagrange.multiplier.lr=0.1"
     )
@@ -212,7 +214,7 @@ def test_episode_signal_uses_each_fresh_episode_once(tmp_path: Path):
     update = lagrange.update
     lagrange.update = lambda violation: (seen.append(violation.tolist()), update(violation))
     data = collect(trainer, 12)
-    limit = episode_budget(0.05, 0.99, duration=1, policy_frequency=5)
+    limit = episode_budget(0.05, 0.99, horizon=5)
     ended = [each["next", "episode_cost"][each["next", "done"]] for each in data]
     expected = [(costs - limit).tolist() for costs in ended if len(costs)]
     assert seen == [pytest.approx(costs) for costs in expected] and len(seen) == 2
@@ -234,7 +236,7 @@ def test_critic_signal_ascends_with_every_update(tmp_path: Path):
     trainer = trainer_of(tmp_path, "algo=arsac", "lagrange.multiplier.lr=0.5", "cost_limit=0")
     collect(trainer, 3)
     value = float(trainer.learner.loss.lagrange.value)
-    losses = trainer.learner.update(trainer.buffer.sample())
+    losses = trainer.learner.update(trainer.experience.buffer.sample())
     assert float(trainer.learner.loss.lagrange.value) == pytest.approx(
         value + 0.5 * float(losses["constraint_violation"]), rel=1e-6
     )
@@ -271,7 +273,7 @@ def test_records(tmp_path: Path):
 
 
 def test_no_episode_need_end(tmp_path: Path):
-    """PEERS 10."""
+    """docs/pitfalls.md, 10."""
     trainer = trainer_of(tmp_path, "algo=sac_lag")
     trainer.window = EpisodeWindow()
     trainer.train()
@@ -304,11 +306,18 @@ def test_compiling_leaves_everyones_warnings_alone(tmp_path: Path, monkeypatch):
 )
 def test_trainer_refuses(name: str, value: int, tmp_path: Path):
     ours = trainer_of(tmp_path, "algo=sac")
-    parts = {key: getattr(ours, key) for key in ("run", "collector", "buffer", "learner", "budget")}
+    names = ("run", "collector", "experience", "learner", "budget")
+    parts = {key: getattr(ours, key) for key in names}
+    buffer = ours.experience.buffer
     with pytest.raises(ValueError, match=f"{name} must be >= "):
-        Trainer(**parts, stored=STORED, **{name: value})
+        if name.endswith("_every"):
+            Trainer(**parts, **{name: value})
+        else:
+            Replay(buffer, STORED, **{name: value})
     with pytest.raises(ValueError, match="save_minutes must be null or > 0, got 0"):
-        Trainer(**parts, stored=STORED, save_minutes=0)
+        Trainer(**parts, save_minutes=0)
+    with pytest.raises(ValueError, match="epochs must be >= 1, got 0"):
+        Epochs(buffer, STORED, begin=print, epochs=0)
 
 
 def test_two_runs_that_start_at_once_do_not_share_a_folder(refusal, monkeypatch, tmp_path: Path):
