@@ -6,7 +6,7 @@ import inspect
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import hydra
 import torch
@@ -76,7 +76,18 @@ def make(node: DictConfig, **objects: Any) -> Any:
 def build_env(
     cfg: DictConfig, scenario: Any, num_envs: int, seed: int, *transforms: Transform
 ) -> EnvBase:
-    """The configured backend with a scenario; transforms from the inside outwards."""
+    """The configured backend with a scenario; transforms from the inside outwards.
+
+    Raises:
+        ValueError: the backend is of another kind of task.
+    """
+    backend = hydra.utils.get_object(cfg.env._target_)
+    kind = get_type_hints(backend.__init__).get("scenario", object)
+    if not isinstance(scenario, kind):
+        raise ValueError(
+            f"{cfg.env._target_} plays a {kind.__name__}, but task={scenario.task} is a "
+            f"{type(scenario).__name__}: leave env= to the task."
+        )
     env = make(cfg.env, scenario=scenario, num_envs=num_envs, seed=seed, device=device_of(cfg))
     return TransformedEnv(env, Compose(*transforms)) if transforms else env  # pyright: ignore
 
@@ -166,9 +177,6 @@ def _check_parts(cfg: DictConfig) -> None:
             raise ValueError(
                 f"{loss} has one state value: set {name}=single, got {cfg[name].members} members."
             )
-    if fresh != cfg.experience._target_.endswith("Epochs"):
-        name = "epochs" if fresh else "replay"
-        raise ValueError(f"{loss} learns from experience={name}, got {cfg.experience._target_}.")
 
 
 def build_agent(cfg: DictConfig) -> Agent:
@@ -325,11 +333,19 @@ def build_learner(cfg: DictConfig, loss: LossModule) -> Learner:
 
 
 def build_experience(cfg: DictConfig, agent: Agent, scenario: Any) -> Replay | Epochs:
-    """What the learner updates from: a replay buffer, or each batch of fresh transitions."""
+    """What the learner updates from: a replay buffer, or each batch of fresh transitions.
+
+    Raises:
+        ValueError: the loss cannot learn from what is configured.
+    """
+    fresh = on_policy(cfg)
+    if fresh != cfg.experience._target_.endswith("Epochs"):
+        name, loss = "epochs" if fresh else "replay", cfg.loss._target_
+        raise ValueError(f"{loss} learns from experience={name}, got {cfg.experience._target_}.")
     device = device_of(cfg)
     generator = torch.Generator(device).manual_seed(cfg.seed)
     keys = (*observed(cfg), *(("next", key) for key in observed(cfg)))
-    if on_policy(cfg):
+    if fresh:
         loss: Any = agent.loss
         frames = cfg.collector.frames_per_env * cfg.env.num_envs
         # TorchRL's own losses leave their advantages to their estimator.

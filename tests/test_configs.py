@@ -69,6 +69,34 @@ def test_every_file_is_an_option_of_a_known_group():
     assert set(ALGOS) >= set(PARTS)
 
 
+#: What ARSAC refuses, and the reason.
+REFUSED = {
+    "cost_critic=none": "needs cost_critic, got cost_critic=none",
+    "env=cart": "plays a Cart, but task=gs is a Scenario",
+    "env=gym": "plays a GymTask, but task=gs is a Scenario",
+    "experience=epochs": "learns from experience=replay",
+    "experiment=cart": "reads ego, vehicles, but task=cart observes observation",
+    "lagrange=none": "needs lagrange, got lagrange=none",
+    "loss=cpo": "takes no lagrange",
+    "loss=ppo": "takes no cost_critic",
+    "loss=ppo_lag": "projector needs cost critics",
+    "loss=sac": "takes no cost_critic",
+    "task=cart": "reads ego, vehicles, but task=cart observes observation",
+    "task=gym": "reads ego, vehicles, but task=gym observes observation",
+}
+
+
+@pytest.mark.parametrize("option", [o for o in OPTIONS if not o.startswith("algo=")])
+def test_option_builds_or_is_refused_with_the_reason(option: str, tmp_path: Path):
+    """Each option of each group, one at a time, in place of ARSAC's own."""
+    cfg = compose(*SMALL, option, *BESIDE.get(option, ()))
+    if option in REFUSED:
+        with pytest.raises(ValueError, match=REFUSED[option]):
+            build_trainer(cfg, tmp_path)
+        return
+    build_trainer(cfg, tmp_path)
+
+
 #: Ways to compose a task with its environment, small.
 TASKS = {
     "batched": ("task=mixed", "env=batched", "task.vehicles=0"),
