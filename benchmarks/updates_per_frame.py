@@ -71,7 +71,7 @@ def main() -> None:
         f"{'updates/frame':>14s}{'seed':>6s}{'minutes':>9s}{'frames':>10s}{'updates':>9s}  success"
     )
     for number, value in enumerate(options.values):
-        common = ["experiment=fresh", f"algo={options.algo}", f"task={options.task}"]
+        common = [f"algo={options.algo}", f"task={options.task}"]
         common += [f"updates_per_frame={value}", *options.set]
         trial = options.out / f"trial_{value}"
         train(trial, WARMUP + int(UPDATES / value), [*common, "evaluation.episodes=1"])
