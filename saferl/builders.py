@@ -208,14 +208,20 @@ def build_agent(cfg: DictConfig) -> Agent:
     def action_value(network: torch.nn.Module, out_key: str) -> torch.nn.Module:
         return value_operator(network, in_keys=(*keys, "action"), out_key=out_key)
 
+    def alone_or_all(members: list[torch.nn.Module]) -> Any:
+        # Of a list of one TorchRL makes parameters that no optimizer sees.
+        return members[0] if len(members) == 1 else members
+
     def cost_critic() -> Any:
         if on_policy(cfg):
             return state_value("state_cost_value")
         # At 0, or a projector would correct every action before the first cost was seen.
-        return [
-            action_value(zero_output(network), "state_action_cost_value")
-            for network in action_values(cfg.cost_critic)
-        ]
+        return alone_or_all(
+            [
+                action_value(zero_output(network), "state_action_cost_value")
+                for network in action_values(cfg.cost_critic)
+            ]
+        )
 
     encoder = policy_encoder()
     wanted: Any = encoder.in_keys
@@ -227,9 +233,9 @@ def build_agent(cfg: DictConfig) -> Agent:
     actor = tanh_gaussian_actor(encoder, width, action_dim, keys).to(device)
     parts = {
         "actor_network": lambda: actor,
-        "qvalue_network": lambda: [
-            action_value(network, "state_action_value") for network in action_values(cfg.critic)
-        ],
+        "qvalue_network": lambda: alone_or_all(
+            [action_value(network, "state_action_value") for network in action_values(cfg.critic)]
+        ),
         "num_qvalue_nets": lambda: cfg.critic.members,
         "critic_network": lambda: state_value("state_value"),
         "cost_critic": cost_critic,

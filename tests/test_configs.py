@@ -212,3 +212,12 @@ def test_kinds():
         fits(None, float | None) and not fits("x", float | None) and fits([1, 2], tuple[float, ...])
     )
     assert "num_envs" in arguments("saferl.envs.intersection.HighwayIntersection")
+
+
+@pytest.mark.parametrize("members", [1, 2, 4])
+def test_any_number_of_critics_is_trained(members: int):
+    loss = build_agent(
+        compose("algo=rsac", *SMALL, f"critic.members={members}", f"cost_critic.members={members}")
+    ).loss
+    trained = {name.split(".")[0] for name, _ in loss.named_parameters()}
+    assert {"actor_network_params", "qvalue_network_params", "cost_critic_params"} <= trained
