@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from copy import deepcopy
 from typing import Any
@@ -17,6 +16,7 @@ from torchrl.objectives.utils import distance_loss
 
 from saferl.modules import BoundCritics, CriticEnsemble, LagrangeMultiplier, Largest
 from saferl.modules.critics import REDUCTIONS
+from saferl.objectives.checks import check_cost, check_gamma, check_limit
 
 #: What the cost critics' target may be of its members' values.
 COST_TARGETS = ("max", "mean")
@@ -25,10 +25,13 @@ COST_BACKUPS = ("sum", "reach")
 
 
 def quantile_loss(predicted: Tensor, target: Tensor) -> Tensor:
-    """Quantile regression with Huber's loss of width 1 (Dabney et al., 2018), summed over the quantiles.
+    """Quantile regression (Koenker and Bassett, 1978), summed over the quantiles.
+
+    Without the quadratic zone of Huber's loss that distributional critics often have: costs are smaller than
+    its usual width of 1, and within it a minimum is an expectile.
 
     Args:
-        predicted: [*B, K], the quantiles at (i + 1/2) / K.
+        predicted: [*B, K], the quantiles at (i + 1/2) / K, in the unit of the cost.
         target: [*B, L], samples of the distribution, equally likely.
 
     Returns:
@@ -37,9 +40,8 @@ def quantile_loss(predicted: Tensor, target: Tensor) -> Tensor:
     count = predicted.shape[-1]
     fraction = (torch.arange(count, device=predicted.device, dtype=predicted.dtype) + 0.5) / count
     error = target.unsqueeze(-2) - predicted.unsqueeze(-1)  # [*B, K, L]
-    huber = torch.where(error.abs() < 1.0, 0.5 * error.square(), error.abs() - 0.5)
-    below = (error.detach() < 0).to(predicted)
-    return ((fraction.unsqueeze(-1) - below).abs() * huber).mean(-1).sum(-1)
+    fraction = fraction.unsqueeze(-1)
+    return torch.maximum(fraction * error, (fraction - 1.0) * error).mean(-1).sum(-1)
 
 
 class CostCriticLoss(LossModule):
@@ -95,8 +97,7 @@ class CostCriticLoss(LossModule):
         create_target_params: bool,
         compare_against: list[nn.Parameter] | None,
     ) -> None:
-        if not (math.isfinite(cost_limit) and cost_limit >= 0):
-            raise ValueError(f"cost_limit must be >= 0, got {cost_limit}.")
+        cost_limit = check_limit(cost_limit)
         if num_cost_critics < 1:
             raise ValueError(f"num_cost_critics must be >= 1, got {num_cost_critics}.")
         for name, value, choices in (
@@ -116,7 +117,7 @@ class CostCriticLoss(LossModule):
         )
         self.lagrange = lagrange
         device = next(self.parameters()).device
-        self.register_buffer("cost_limit", torch.tensor(float(cost_limit), device=device))
+        self.register_buffer("cost_limit", torch.tensor(cost_limit, device=device))
         # Made here, not at the first call: a fresh loss then loads a state_dict strictly.
         self._default_value_estimator()
 
@@ -135,9 +136,7 @@ class CostCriticLoss(LossModule):
         Raises:
             ValueError: ``gamma`` lies outside [0, 1].
         """
-        gamma = hyperparams.get("gamma", 0.0)
-        if not 0 <= gamma <= 1:
-            raise ValueError(f"gamma must be in [0, 1], got {gamma}.")
+        check_gamma(hyperparams)
         super().make_value_estimator(value_type, **hyperparams)
         self._cost_value_estimator = deepcopy(self._value_estimator)
         self._forward_value_estimator_keys()
@@ -217,12 +216,7 @@ class CostCriticLoss(LossModule):
         Raises:
             KeyError: the batch holds no cost.
         """
-        if tensordict.get(("next", self.tensor_keys.cost), None) is None:
-            raise KeyError(
-                f"The batch has no entry {('next', self.tensor_keys.cost)}; under 'next' it has "
-                f"{sorted(map(str, tensordict.get('next').keys()))}. "
-                "Name your cost with loss.set_keys(cost=...)."
-            )
+        check_cost(tensordict, self.tensor_keys.cost)
         next_state, _ = next_sample or self._sample_next(tensordict)
         with torch.no_grad():
             target_critics = self._bind(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -13,6 +13,7 @@ from torch.distributions import Distribution, Independent, TransformedDistributi
 from torchrl.objectives import PPOLoss
 
 from saferl.objectives.advantages import CostValueLoss
+from saferl.objectives.checks import check_limit
 from saferl.objectives.ppo import CostKeys
 from saferl.objectives.trust_region import (
     CASES,
@@ -48,9 +49,9 @@ class CPOLoss(CostValueLoss, PPOLoss):
     with g and b the gradients of the mean of ratio times advantage, of reward and cost, H the Fisher matrix of
     the policy, and :math:`c = (J_c - d) / w` the violation *per decision*: g and b are means over decisions,
     and :math:`J_c(\pi') - J_c(\pi)` is to first order :math:`w = \sum_{t<L} \gamma^t` times such a mean, L an
-    episode's mean length. :math:`J_c` is the discounted cost from the start states; ``gamma=1`` makes it an
-    episode's sum. Without that division the constraint is some hundred times too strict or too loose, and the
-    quadratic cases never occur.
+    episode's mean length over the last batches. :math:`J_c` is the discounted cost of an episode from its start
+    to its end, by termination or truncation; ``gamma=1`` makes it the plain sum. Without that division the
+    constraint is some hundred times too strict or too loose, and the quadratic cases never occur.
 
     The step is shortened by ``backtrack`` until the KL is within delta, the surrogate does not get worse, and
     the cost's surrogate does not rise above its limit (above where it was, from an infeasible start); if none
@@ -70,6 +71,8 @@ class CPOLoss(CostValueLoss, PPOLoss):
         damping (float, optional): added to H's diagonal. Defaults to ``0.1``.
         search_steps (int, optional): how often a step is shortened at most. Defaults to ``15``.
         backtrack (float, optional): factor of each shortening. Defaults to ``0.8``.
+        critic_coeff, loss_critic_type, separate_losses, reduction: as in
+            :class:`~torchrl.objectives.PPOLoss`. Default here: ``loss_critic_type="l2"``.
 
     Reads: :meth:`begin` a whole batch ``[*B, T]`` with the policy's ``"action"`` and its log-probability, under
         ``"next"`` ``"reward"``, ``"cost"``, ``"done"``, ``"terminated"``, and ``"is_init"``
@@ -112,7 +115,11 @@ class CPOLoss(CostValueLoss, PPOLoss):
     _AcceptedKeys = CostKeys
     default_keys = CostKeys
 
+    cost_limit: Tensor
     report: Tensor
+    starts: Tensor
+    decisions: Tensor
+    cost_return: Tensor
 
     def __init__(
         self,
@@ -126,8 +133,10 @@ class CPOLoss(CostValueLoss, PPOLoss):
         damping: float = 0.1,
         search_steps: int = 15,
         backtrack: float = 0.8,
-        loss_critic_type: str = "l2",
-        **settings: Any,
+        critic_coeff: float = 1.0,
+        loss_critic_type: Literal["l1", "l2", "smooth_l1"] = "l2",
+        separate_losses: bool = False,
+        reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
         for name, value in (("trust", trust), ("damping", damping)):
             if not (math.isfinite(value) and value > 0):
@@ -141,14 +150,21 @@ class CPOLoss(CostValueLoss, PPOLoss):
             actor_network,
             critic_network,
             entropy_bonus=False,
+            critic_coeff=critic_coeff,
             loss_critic_type=loss_critic_type,
-            **settings,
+            separate_losses=separate_losses,
+            reduction=reduction,
         )
-        self._add_cost_value(cost_critic, cost_limit)
+        self._add_cost_value(cost_critic)
+        device = next(self.parameters()).device
+        self.register_buffer("cost_limit", torch.tensor(check_limit(cost_limit), device=device))
         self.trust, self.cg_steps, self.damping = trust, cg_steps, damping
         self.search_steps, self.backtrack = search_steps, backtrack
         # Of the last step: KL, J_c, fraction of the step, number of the case.
-        self.register_buffer("report", torch.full((4,), torch.nan, device=self.cost_limit.device))
+        self.register_buffer("report", torch.full((4,), torch.nan, device=device))
+        # Episodes that began and decisions that were made, in the last batches; the last J_c.
+        for name in ("starts", "decisions", "cost_return"):
+            self.register_buffer(name, torch.zeros((), dtype=torch.float64, device=device))
 
     @torch.no_grad()
     def begin(self, tensordict: TensorDictBase) -> None:
@@ -166,6 +182,33 @@ class CPOLoss(CostValueLoss, PPOLoss):
         cost, weight = self.cost_of_policy(tensordict)
         self._step(tensordict.reshape(-1), (cost - self.cost_limit) / weight)
         self.report[1] = cost
+
+    def cost_of_policy(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        r"""The discounted cost of an episode of the policy that collected a batch, and its decisions.
+
+        :math:`J_c = E_{s_0}[\sum_{t<L} \gamma^t c_t]` is the mean of the cost's value targets at the episodes' first
+        steps (``"is_init"``, of TorchRL's ``InitTracker``), the last one where no episode begins in the batch.
+        The second is :math:`w = \sum_{t<L} \gamma^t`, L the decisions for each episode that began, in this batch and,
+        with weights that fall by a tenth from one to the next, in those before. Each call counts its batch.
+
+        Args:
+            tensordict: ``[*B, T]`` as :meth:`CostValueLoss.begin` leaves it.
+
+        Returns:
+            Two scalars, J_c in the unit of the cost.
+        """
+        target = tensordict.get(self.tensor_keys.cost_value_target).squeeze(-1)
+        first = tensordict.get(self.tensor_keys.is_init).squeeze(-1).to(target)
+        count = first.sum()
+        known = target.mean() if self.starts == 0 else self.cost_return.to(target)
+        cost = torch.where(count > 0, (first * target).sum() / count.clamp_min(1), known)
+        self.cost_return.copy_(cost)
+        self.starts.mul_(0.9).add_(count)
+        self.decisions.mul_(0.9).add_(target.numel())
+        length = (self.decisions / self.starts.clamp_min(1)).to(target)
+        gamma = self._cost_value_estimator.gamma.to(target)
+        weight = torch.where(gamma < 1, (1 - gamma**length) / (1 - gamma).clamp_min(1e-12), length)
+        return cost, weight
 
     def _surrogates(
         self, batch: TensorDictBase, old: Distribution

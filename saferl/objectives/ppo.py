@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Literal
 
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
@@ -53,17 +53,17 @@ class PPOLagLoss(CostValueLoss, ClipPPOLoss):
 
     Keyword Args:
         lagrange (LagrangeMultiplier): the multiplier, saved with the loss.
-        cost_limit (float, optional): reported beside the cost; the multiplier's signal has its own.
-            Defaults to ``0.05``.
-        **settings: as in :class:`~torchrl.objectives.ClipPPOLoss`. Defaults here: ``entropy_bonus=False``,
-            ``normalize_advantage=True``, ``loss_critic_type="l2"``.
+        clip_epsilon, entropy_bonus, entropy_coeff, critic_coeff, clip_value, loss_critic_type,
+            normalize_advantage, separate_losses, reduction: as in
+            :class:`~torchrl.objectives.ClipPPOLoss`. Defaults here: ``entropy_bonus=False``,
+            ``normalize_advantage=True`` (of each batch that the loss is given), ``loss_critic_type="l2"``.
 
     Reads what :meth:`begin` leaves in a batch, in any batch shape ``[*B]``.
     Writes ``"loss_objective"``, ``"loss_critic"``, ``"loss_cost"``, ClipPPOLoss's reports and
     ``"lagrange_multiplier"``.
 
     Raises:
-        ValueError: ``cost_limit`` is negative or not finite, or ``gamma`` lies outside [0, 1].
+        ValueError: ``clip_epsilon`` is not positive, or ``gamma`` lies outside [0, 1].
         KeyError: the batch holds no cost, or ``begin`` has not seen it.
 
     Examples:
@@ -103,21 +103,32 @@ class PPOLagLoss(CostValueLoss, ClipPPOLoss):
         cost_critic: TensorDictModule,
         *,
         lagrange: LagrangeMultiplier,
-        cost_limit: float = 0.05,
+        clip_epsilon: float = 0.2,
         entropy_bonus: bool = False,
+        entropy_coeff: float = 0.01,
+        critic_coeff: float = 1.0,
+        clip_value: bool | float = False,
+        loss_critic_type: Literal["l1", "l2", "smooth_l1"] = "l2",
         normalize_advantage: bool = True,
-        loss_critic_type: str = "l2",
-        **settings: Any,
+        separate_losses: bool = False,
+        reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
+        if not clip_epsilon > 0:
+            raise ValueError(f"clip_epsilon must be > 0, got {clip_epsilon}.")
         super().__init__(
             actor_network,
             critic_network,
+            clip_epsilon=clip_epsilon,
             entropy_bonus=entropy_bonus,
-            normalize_advantage=normalize_advantage,
+            entropy_coeff=entropy_coeff,
+            critic_coeff=critic_coeff,
+            clip_value=clip_value,
             loss_critic_type=loss_critic_type,
-            **settings,
+            normalize_advantage=normalize_advantage,
+            separate_losses=separate_losses,
+            reduction=reduction,
         )
-        self._add_cost_value(cost_critic, cost_limit)
+        self._add_cost_value(cost_critic)
         self.lagrange = lagrange
 
     @dispatch()

@@ -70,7 +70,7 @@ def batch_of(actor, envs: int = 4, steps: int = 7, seed: int = 1) -> TensorDict:
 
 @pytest.mark.parametrize("kind", LOSSES)
 def test_advantages_match_a_loop(kind: str):
-    """Of reward and of cost: through a truncation with the value behind it, not through a termination."""
+    """Through a truncation with the value behind it, not through a termination; an episode's cost ends with it."""
     loss, actor = build(kind)
     data = batch_of(actor)
     # CPO moves the policy in the same call; the values that the advantages use do not move.
@@ -85,6 +85,7 @@ def test_advantages_match_a_loop(kind: str):
             then = network(data["next"].select("observation"))[network.out_keys[0]].squeeze(-1)
         signal = data["next", key].squeeze(-1)
         end, dead = (data["next", k].squeeze(-1) for k in ("done", "terminated"))
+        dead = end if key == "cost" else dead
         expected = torch.zeros_like(now)
         for row in range(now.shape[0]):
             running = 0.0
@@ -180,16 +181,47 @@ def test_cost_of_the_policy_is_that_of_its_starts():
     cost, weight = loss.cost_of_policy(data)
     first = data["is_init"].squeeze(-1)
     torch.testing.assert_close(cost, data["cost_value_target"].squeeze(-1)[first].mean())
-    length = data.numel() / int(first.sum())
+    starts = int(first.sum())
+    length = data.numel() / starts
     assert float(weight) == pytest.approx((1 - GAMMA**length) / (1 - GAMMA))
-    # No episode begins: the mean over all states, and a weight of an endless one.
+    # No episode begins: the cost that was known, and a length over both batches.
     data["is_init"].zero_()
+    again, weight = loss.cost_of_policy(data)
+    assert float(again) == pytest.approx(float(cost))
+    length = 1.9 * data.numel() / (0.9 * starts)
+    assert float(weight) == pytest.approx((1 - GAMMA**length) / (1 - GAMMA))
+
+
+@pytest.mark.parametrize("gamma", [0.9, 1.0])
+def test_cost_of_an_episode_ends_with_it(gamma: float):
+    """By truncation too, and with gamma=1: what V_c converges to is the sum over the episode that was played."""
+    loss, actor = build("cpo")
+    loss.make_value_estimator(ValueEstimators.GAE, gamma=gamma, lmbda=1.0)
+    data = batch_of(actor, steps=6)
+    for key in ("done", "terminated"):
+        data["next", key].zero_()
+    data["next", "done"][:, 2::3] = True  # two episodes of three decisions, truncated
+    data["is_init"].zero_()[:, 0::3] = True
+    super(CPOLoss, loss).begin(data)
     cost, weight = loss.cost_of_policy(data)
-    torch.testing.assert_close(cost, data["cost_value_target"].mean())
-    assert 0.9 / (1 - GAMMA) < float(weight) <= 1 / (1 - GAMMA)
-    loss.make_value_estimator(ValueEstimators.GAE, gamma=1.0, lmbda=LAMBDA)
-    data["is_init"][:, 0] = True
-    assert float(loss.cost_of_policy(data)[1]) == 7.0
+    each = data["next", "cost"].reshape(-1, 3) @ (gamma ** torch.arange(3, dtype=torch.float64))
+    assert float(cost) == pytest.approx(float(each.mean()))
+    assert float(weight) == pytest.approx(sum(gamma**t for t in range(3)))
+
+
+def test_length_of_episodes_does_not_jump_with_the_batches():
+    """Ends that fall into few of the batches: 200 decisions an episode, 8 side by side, batches of 128 each."""
+    loss, actor = build("cpo")
+    loss.make_value_estimator(ValueEstimators.GAE, gamma=1.0, lmbda=0.9)
+    data = batch_of(actor, envs=8, steps=128)
+    data["next", "done"].zero_()
+    super(CPOLoss, loss).begin(data)
+    weights = []
+    for number in range(25):
+        step = torch.arange(128) + 128 * number
+        data["is_init"] = (step % 200 == 0)[None, :, None].expand(8, 128, 1)
+        weights.append(float(loss.cost_of_policy(data)[1]))
+    assert all(160 < weight < 250 for weight in weights[5:]), weights
 
 
 def test_kl_of_squashed_policies():
@@ -289,8 +321,6 @@ def test_refuses(kind: str):
     data = batch_of(actor)
     with pytest.raises(KeyError, match=r"no entry \('next', 'cost'\)"):
         loss.begin(data.exclude(("next", "cost")))
-    with pytest.raises(ValueError, match=r"cost_limit must be >= 0, got -1"):
-        build(kind, cost_limit=-1)
     with pytest.raises(ValueError, match=r"gamma must be in \[0, 1\], got 2"):
         loss.make_value_estimator(ValueEstimators.GAE, gamma=2, lmbda=0.9)
 
@@ -299,6 +329,7 @@ def test_refuses(kind: str):
     ("setting", "message"),
     [
         ({"trust": 0.0}, "trust must be > 0, got 0.0"),
+        ({"cost_limit": -1}, "cost_limit must be >= 0, got -1"),
         ({"damping": math.nan}, "damping must be > 0, got nan"),
         ({"cg_steps": 0}, "cg_steps must be >= 1, got 0"),
         ({"search_steps": 0}, "search_steps must be >= 1, got 0"),
@@ -308,6 +339,11 @@ def test_refuses(kind: str):
 def test_cpo_refuses(setting: dict, message: str):
     with pytest.raises(ValueError, match=message):
         build("cpo", **setting)
+
+
+def test_ppo_lag_refuses():
+    with pytest.raises(ValueError, match="clip_epsilon must be > 0, got -1"):
+        build(clip_epsilon=-1)
 
 
 def test_cpo_needs_to_know_where_episodes_begin():

@@ -1,0 +1,45 @@
+"""What all constrained losses refuse alike."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+
+
+def check_limit(cost_limit: float) -> float:
+    """A limit on costs, in their unit.
+
+    Raises:
+        ValueError: it is negative or not finite.
+    """
+    if not (math.isfinite(cost_limit) and cost_limit >= 0):
+        raise ValueError(f"cost_limit must be >= 0, got {cost_limit}.")
+    return float(cost_limit)
+
+
+def check_gamma(hyperparams: dict[str, Any]) -> None:
+    """The discount among an estimator's settings, if it is there.
+
+    Raises:
+        ValueError: it lies outside [0, 1].
+    """
+    gamma = hyperparams.get("gamma", 0.0)
+    if not 0 <= gamma <= 1:
+        raise ValueError(f"gamma must be in [0, 1], got {gamma}.")
+
+
+def check_cost(tensordict: TensorDictBase, key: NestedKey) -> None:
+    """That a batch ``[*B]`` holds a cost under ``"next"``.
+
+    Raises:
+        KeyError: it does not; tells what is there.
+    """
+    if tensordict.get(("next", key), None) is None:
+        raise KeyError(
+            f"The batch has no entry {('next', key)}; under 'next' it has "
+            f"{sorted(map(str, tensordict.get('next').keys()))}. "
+            "Name your cost with loss.set_keys(cost=...)."
+        )
