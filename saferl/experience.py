@@ -78,7 +78,7 @@ class Epochs:
     """Each batch of fresh transitions is gone through a few times in mini-batches, and forgotten.
 
     Args:
-        buffer: as large as a batch, with a sampler without replacement.
+        buffer: as large as a batch, with a generator and a sampler without replacement.
         stored: keys of a transition that the loss reads, where they exist.
         begin: is given each batch [B, T] first, and writes advantages and value targets into it.
         epochs: how often a batch is gone through.
@@ -116,8 +116,8 @@ class Epochs:
             yield from self.buffer
 
     def state_dict(self) -> dict[str, Any]:
-        """Nothing outlives a batch, and checkpoints are made between them."""
-        return {}
+        """What shuffles the mini-batches: no transition outlives its batch, and checkpoints are made between them."""
+        return {"generator": self.buffer._rng.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        pass
+        self.buffer._rng.set_state(state["generator"].cpu())

@@ -36,7 +36,7 @@ class Learner:
     Raises:
         ValueError: ``order`` is unknown.
 
-    The groups of the optimizer are called ``"critic"``, ``"actor"`` and ``"alpha"``.
+    The groups of the optimizer are called ``"critic"``, ``"actor"`` and ``"alpha"``, as far as there are any.
     """
 
     def __init__(
@@ -50,7 +50,8 @@ class Learner:
     ):
         if order not in ORDERS:
             raise ValueError(f"order must be one of {', '.join(ORDERS)}, got {order!r}.")
-        self.stages = ORDERS[order]
+        there = {group["name"] for group in optimizer.param_groups}
+        self.stages = [names for names in ORDERS[order] if there & set(names)]
         self.loss, self.optimizer, self.target_updater = loss, optimizer, target_updater
         self.after_update = after_update or []
         self._forward = loss

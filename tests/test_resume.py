@@ -49,10 +49,11 @@ def restored(run: Path, *overrides: str) -> Trainer:
     return trainer
 
 
-@pytest.mark.parametrize("algo", ["sac", "arsac"])
+@pytest.mark.parametrize("algo", ["sac", "arsac", "ppo_lag"])
 def test_killed_and_resumed_equals_uninterrupted(algo: str, tmp_path: Path, spawn):
     """SIGKILL in mid-episode on highway-env with traffic, a projector at work in ``arsac``."""
     options = [*SMALL, *TRAFFIC, f"algo={algo}", "frames=48", "save_every=4"]
+    options += ["batch_size=2", "rollout_frames=4"] if algo == "ppo_lag" else []
     if (
         algo == "arsac"
     ):  # rectangles that overlap now, so that there is a cost to learn and to avoid
@@ -74,7 +75,8 @@ def test_killed_and_resumed_equals_uninterrupted(algo: str, tmp_path: Path, spaw
     one, other = (restored(tmp_path / name, *options) for name in ("whole", "killed"))
     assert one.progress.frames == 48 and one.progress.updates > 10
     assert_same(everything(one), everything(other))
-    assert len(one.experience.buffer) == 48  # a true buffer was compared
+    if algo != "ppo_lag":
+        assert len(one.experience.buffer) == 48  # a true buffer was compared
     if algo == "arsac":
         rows = one.experience.buffer[:]
         assert (rows["action"] != rows["action_proposed"]).any()
@@ -95,14 +97,15 @@ def test_every_later_step_is_the_same(algo: str, vehicles: int, scenario: str, t
     """In one process: the state after a resume equals the state that was saved, and so does each
     update, action and environment step from there, with a multiplier, a late projector, a PID's
     memory, a buffer that has wrapped round, and loss sums of half a row."""
-    options = [*SMALL, *EMPTY, f"algo={algo}", "frames=120", "record_every=31", "save_every=1000"]
-    options += ["buffer_size=40", "task.duration=3"]
+    frames = 240 if algo in ("ppo_lag", "cpo") else 120
+    options = [*SMALL, *EMPTY, f"algo={algo}", f"frames={frames}", "record_every=31"]
+    options += ["save_every=1000", "buffer_size=40", "rollout_frames=24", "task.duration=3"]
     options += [f"task.vehicles={vehicles}", f"task.scenario={scenario}"]
     options += ["projector.start=0.4", "lagrange=pid"] if algo == "rsac" else []
     trainer = build_trainer(compose(*options), tmp_path / "a")
     trainer.save()
     batches = iter(trainer.collector)
-    for _ in range(35):
+    while trainer.spent < 0.45:
         trainer._take(next(batches))
         if trainer.progress.frames - trainer.progress.last_record >= trainer.record_every:
             trainer._record()
@@ -116,7 +119,9 @@ def test_every_later_step_is_the_same(algo: str, vehicles: int, scenario: str, t
         assert ours[key].stride() == theirs[key].stride()
     rng = trainer.checkpoint.checkpoint.components["rng"]
     state = rng.state_dict()
+    before = trainer.progress.updates
     trainer.train()
+    assert trainer.progress.updates >= before + 20  # there was something left to differ in
     rng.load_state_dict(state)
     copy.train()
     assert_same(everything(trainer), everything(copy))
