@@ -16,7 +16,7 @@ from pathlib import Path
 import hydra
 import torch
 
-from saferl.builders import load_agent
+from saferl.agents import load_agent
 from saferl.checkpoint import run_config
 from saferl.envs.intersection import BatchedIntersection
 from saferl.envs.seeding import episode_seeds

@@ -21,7 +21,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import SoftUpdate
 
-from saferl.builders import load_agent
+from saferl.agents import load_agent
 from saferl.checkpoint import run_config
 from saferl.envs.intersection import BatchedIntersection
 from saferl.modules import DualAscent, MLPValue, MMAMValue, value_operator, zero_output

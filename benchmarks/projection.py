@@ -21,7 +21,7 @@ from torchrl.checkpoint import Checkpoint
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from saferl.builders import load_agent
+from saferl.agents import load_agent
 from saferl.checkpoint import latest
 from saferl.commands import run_config
 from saferl.components import BufferState

@@ -34,7 +34,8 @@ from tensordict import TensorDict
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
-from saferl.builders import build_agent, build_learner
+from saferl.agents import build_agent
+from saferl.builders import build_learner
 from saferl.learner import Learner
 from saferl.paths import config_dir
 

@@ -19,7 +19,8 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.transforms import Transform
 
 from saferl import checkpoint
-from saferl.builders import build_env, build_trainer, complete, load_agent
+from saferl.agents import load_agent
+from saferl.builders import build_env, build_trainer, complete
 from saferl.checkpoint import CONFIG, run_config, run_folder
 from saferl.envs.intersection import Scenario
 from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver

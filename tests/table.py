@@ -56,6 +56,8 @@ class Table:
 class TableEnv(SeededEnv):
     """:class:`Table` as a batch of tensors; ``observation`` is the state, one-hot."""
 
+    kept = (*SeededEnv.kept, "_seeds", "_steps", "_where")
+
     def __init__(self, scenario: Table, num_envs: int = 1, seed: int = 0, device=None):
         super().__init__(num_envs, device)
         self.scenario = scenario
@@ -97,12 +99,3 @@ class TableEnv(SeededEnv):
             },
             batch_size=self.batch_size,
         )
-
-    def state_dict(self, *args, **kwargs):
-        names = ("_stream", "_episode", "_seeds", "_steps")
-        return {name.lstrip("_"): getattr(self, name) for name in names}
-
-    def load_state_dict(self, state_dict, *args, **kwargs):
-        for name, value in state_dict.items():
-            setattr(self, f"_{name}", value.clone())
-        self._observe()

@@ -15,7 +15,8 @@ from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from saferl.builders import build_agent, build_trainer, load_agent
+from saferl.agents import build_agent, load_agent
+from saferl.builders import build_trainer
 from saferl.checkpoint import CONFIG, EXPORTED, RunCheckpoint, export, latest, run_folder
 from saferl.components import BufferState, Fitting, GrowingFiles
 from saferl.paths import pretrained_run

@@ -13,7 +13,8 @@ import torch
 from omegaconf import OmegaConf
 from small import EMPTY, SMALL, compose
 
-from saferl.builders import build_agent, build_trainer, load_agent
+from saferl.agents import build_agent, load_agent
+from saferl.builders import build_trainer
 from saferl.checkpoint import CONFIG, run_config
 from saferl.trainer import _interrupts
 

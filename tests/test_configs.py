@@ -9,7 +9,8 @@ import pytest
 from omegaconf import OmegaConf
 from small import SMALL, compose
 
-from saferl.builders import build_agent, build_trainer
+from saferl.agents import build_agent
+from saferl.builders import build_trainer
 from saferl.modules import MLPPolicyEncoder, MMAMPolicyEncoder
 from saferl.paths import config_dir
 from saferl.validation import arguments, check_testing, check_training, fits

@@ -87,7 +87,8 @@ def test_objectives_import_only_modules(name):
 
 @pytest.mark.parametrize("name", of("trainer", "metrics", "checkpoint"))
 def test_the_loop_imports_no_concrete_part(name):
-    concrete = {"envs", "modules", "objectives", "builders", "hooks", *COMMANDS}
+    concrete = {"envs", "modules", "objectives", "agents", "builders", "experience", "hooks"}
+    concrete |= COMMANDS
     reached, queue = set(), [name]
     while queue:
         new = GRAPH[queue.pop()] - reached
@@ -99,6 +100,8 @@ def test_the_loop_imports_no_concrete_part(name):
 def test_only_the_commands_import_the_builders():
     importers = {part(name) for name in MODULES if "saferl.builders" in GRAPH[name]}
     assert importers <= COMMANDS
+    importers = {part(name) for name in MODULES if "saferl.agents" in GRAPH[name]}
+    assert importers <= COMMANDS | {"builders"}
 
 
 def test_there_is_no_cycle():

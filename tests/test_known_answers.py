@@ -68,7 +68,7 @@ def test_cart(algo: str, seed: int, tmp_path: Path):
 
 
 TABLE = (
-    "encoder=mlp", "task=cart", "task._target_=table.Table", "task.task=table", "task.size=4",
+    "encoder=mlp", "task=cart", "~task.spread", "~task.noise", "task._target_=table.Table", "task.task=table", "task.size=4",
     "task.horizon=10", "env._target_=table.TableEnv", "env.num_envs=64", "cost_limit=1",
     "gamma=0.8", "frames=200000", "updates_per_frame=0.04", "encoder.policy.width=32",
     "encoder.policy.depth=2", "reward_scale=1", "target_entropy=-3", "compile=false",

@@ -9,7 +9,8 @@ from small import compose
 from tensordict import TensorDict
 from torchrl.objectives import SoftUpdate
 
-from saferl.builders import build_agent, build_optimizer
+from saferl.agents import build_agent
+from saferl.builders import build_optimizer
 from saferl.learner import Learner
 from saferl.modules import compiled
 

@@ -12,7 +12,6 @@ import torch
 from scipy.linalg import solve_discrete_are
 from scipy.optimize import brentq
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 
 from saferl.envs.seeding import SeededEnv, uniform
@@ -34,6 +33,9 @@ class Cart:
         horizon: decisions of an episode.
         spread, noise: see above.
         size, action_dim, task: of the observation, of the action, and what runs are called.
+
+    Raises:
+        ValueError: a setting is out of range.
     """
 
     horizon: int = 20
@@ -42,6 +44,14 @@ class Cart:
     size: int = 2
     action_dim: int = 1
     task: str = "cart"
+
+    def __post_init__(self):
+        for name, least in (("horizon", 1), ("spread", 0), ("noise", 0)):
+            if not getattr(self, name) >= least:
+                raise ValueError(f"task.{name} must be >= {least}, got {getattr(self, name)}.")
+        for name, value in (("size", 2), ("action_dim", 1)):
+            if getattr(self, name) != value:
+                raise ValueError(f"task.{name} is {value} of a cart, got {getattr(self, name)}.")
 
     def sums(
         self, gain: np.ndarray, gamma: float, horizon: float = math.inf
@@ -111,6 +121,8 @@ class CartEnv(SeededEnv):
     torch.Size([3, 2, 1])
     """
 
+    kept = (*SeededEnv.kept, "_seeds", "_steps", "_state")
+
     def __init__(self, scenario: Cart, num_envs: int = 1, seed: int = 0, device=None):
         super().__init__(num_envs, device)
         self.scenario = scenario
@@ -158,11 +170,3 @@ class CartEnv(SeededEnv):
             batch_size=self.batch_size,
             device=self.device,
         )
-
-    def state_dict(self, *args, **kwargs) -> dict[str, Tensor]:
-        names = ("_stream", "_episode", "_seeds", "_steps", "_state")
-        return {name.lstrip("_"): getattr(self, name) for name in names}
-
-    def load_state_dict(self, state_dict: dict[str, Tensor], *args, **kwargs) -> None:
-        for name, value in state_dict.items():
-            setattr(self, f"_{name}", value.to(self.device or "cpu").clone())

@@ -13,11 +13,10 @@ import numpy as np
 import torch
 from gymnasium.spaces import Box
 from gymnasium.wrappers import FlattenObservation, RescaleAction
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
 
-from saferl.envs.seeding import SeededEnv
+from saferl.envs.seeding import ReplayedEnv
 
 
 @dataclass(frozen=True)
@@ -30,12 +29,12 @@ class GymTask:
             values (observation, reward, cost, terminated, truncated, info), as Safety-Gymnasium's, says its
             cost itself.
         kwargs: of the environment.
-        size, action_dim, horizon: numbers of an observation and of an action, and decisions of an episode at
-            most. Taken from the environment where they are None.
+        size, action_dim: numbers of an observation and of an action: the environment's own.
+        horizon: decisions of an episode at most; None: as many as the environment is registered with.
         task: what runs are called.
 
     Raises:
-        ValueError: there is no such environment.
+        ValueError: a setting cannot be meant.
     """
 
     id: str
@@ -46,47 +45,59 @@ class GymTask:
     horizon: int | None = None
     task: str = "gym"
 
+    def __post_init__(self):
+        if self.horizon is not None and self.horizon < 1:
+            raise ValueError(f"task.horizon must be null or >= 1, got {self.horizon}.")
+
     def make(self) -> gymnasium.Env:
-        """One environment: flat observations, actions in [-1, 1].
+        """One environment as it is, but for its time limit, which :class:`GymEnvs` keeps.
 
         Raises:
-            ValueError: it cannot be made, or its actions are not a finite box.
+            ValueError: it cannot be made, or its actions are not a bounded box of real numbers.
         """
         module, _, name = self.id.rpartition(":")
         try:
             if module:
                 importlib.import_module(module)
-            # Six values of a step would not pass the checker.
-            env = gymnasium.make(name, disable_env_checker=True, **(self.kwargs or {}))
-        except (gymnasium.error.Error, ImportError) as error:
+            # Neither gymnasium's checker nor its time limit passes six values of a step on.
+            env = gymnasium.make(
+                name, max_episode_steps=-1, disable_env_checker=True, **(self.kwargs or {})
+            )
+        except (gymnasium.error.Error, ImportError, TypeError) as error:
             raise ValueError(f"task.id: {self.id} cannot be made: {error}") from error
         space = env.action_space
-        if not (isinstance(space, Box) and len(space.shape) == 1 and space.is_bounded("both")):
+        real = isinstance(space, Box) and np.issubdtype(space.dtype, np.floating)
+        if not (real and len(space.shape) == 1 and space.is_bounded("both")):  # pyright: ignore
             raise ValueError(
-                f"task.id: {self.id} must have actions in a bounded box [A], got {space}."
+                f"task.id: {self.id} must have actions in a bounded box [A] of floats, got {space}."
             )
         return env
 
     def complete(self) -> dict[str, int]:
-        """What is left open of ``size``, ``action_dim`` and ``horizon``, from the environment itself."""
+        """What is left open of ``size``, ``action_dim`` and ``horizon``, from the environment itself.
+
+        Raises:
+            ValueError: what is not open differs from it.
+        """
         env = self.make()
-        limit = self.horizon or (env.spec.max_episode_steps if env.spec else None)
-        if limit is None:
+        limit = gymnasium.spec(self.id.rpartition(":")[2]).max_episode_steps
+        if self.horizon is None and limit is None:
             raise ValueError(f"task.horizon must be given: {self.id} has no time limit of its own.")
         found = {
             "size": gymnasium.spaces.flatdim(env.observation_space),
             "action_dim": env.action_space.shape[0],  # pyright: ignore[reportOptionalSubscript]
-            "horizon": limit,
         }
         env.close()
-        return found
+        for key, value in found.items():
+            if getattr(self, key) not in (None, value):
+                raise ValueError(f"task.{key} is {value} in {self.id}, got {getattr(self, key)}.")
+        return {**found, "horizon": min(x for x in (self.horizon, limit) if x is not None)}
 
 
-class GymEnvs(SeededEnv):
+class GymEnvs(ReplayedEnv):
     """``num_envs`` gymnasium environments, stepped one after the other in this process.
 
-    An episode that has ended stands still until its reset. A run continues exactly after a resume where an
-    episode follows from its seed and its actions, which are replayed.
+    A run continues exactly after a resume where an episode follows from its seed and its actions.
 
     Args:
         scenario: which environment.
@@ -98,8 +109,8 @@ class GymEnvs(SeededEnv):
     float32, ``reward`` and ``cost`` [B, 1].
 
     Raises:
-        ValueError: as :meth:`GymTask.make`.
-        KeyError: a step's ``info`` has no ``cost_key``.
+        ValueError: as :meth:`GymTask.make`; or, in an episode, no ``cost_key`` in ``info``, or an observation,
+            reward or cost that is no finite number.
 
     >>> env = GymEnvs(GymTask("Pendulum-v1", cost_key=None), num_envs=2)
     >>> env.rollout(3)["next", "cost"].shape
@@ -109,7 +120,6 @@ class GymEnvs(SeededEnv):
     def __init__(self, scenario: GymTask, num_envs: int = 1, seed: int = 0, device=None):
         super().__init__(num_envs, device)
         self.scenario = scenario
-        self.envs = [self._make() for _ in range(num_envs)]
         batch, facts = self.batch_size, scenario.complete()
         self.horizon = facts["horizon"]
         self.observation_spec = Composite(
@@ -117,78 +127,42 @@ class GymEnvs(SeededEnv):
         )
         self.action_spec = Bounded(-1.0, 1.0, shape=(*batch, facts["action_dim"]))
         self._make_ends()
-        self._seeds = torch.zeros(num_envs, dtype=torch.int64)
-        self._actions: list[list[np.ndarray]] = [[] for _ in range(num_envs)]
-        self._last: list[dict[str, Any]] = [{} for _ in range(num_envs)]
+        self._make_memory()
+        self.envs = [self._make() for _ in range(num_envs)]
         self.set_seed(seed)
 
     def _make(self) -> gymnasium.Env:
         env = self.scenario.make()
-        space = env.action_space
+        ones = np.ones(env.action_space.shape, np.float32)  # pyright: ignore
         env = _Cost(env, self.scenario.cost_key)
-        low, high = (np.full(space.shape, sign, np.float32) for sign in (-1.0, 1.0))  # pyright: ignore
-        return FlattenObservation(RescaleAction(env, low, high))
+        return FlattenObservation(RescaleAction(env, -ones, ones))
 
-    def _stack(self, keys: tuple[str, ...]) -> TensorDict:
-        out = {key: np.stack([last[key] for last in self._last]) for key in keys}
-        values = {
-            key: torch.from_numpy(value).to(self.device or "cpu") for key, value in out.items()
-        }
-        return TensorDict(values, batch_size=self.batch_size, device=self.device)
+    def _stack(self, ended: bool) -> TensorDict:
+        keys = ("observation",)
+        if ended:
+            keys += ("reward", "cost", "terminated", "truncated", "done")
+        values = {key: np.stack([last[key] for last in self._last]) for key in keys}
+        tensors = {key: torch.from_numpy(value) for key, value in values.items()}
+        return TensorDict(tensors, self.batch_size).to(self.device or "cpu")
 
-    def _reset_one(self, index: int) -> None:
-        self._actions[index] = []
-        observation, _ = self.envs[index].reset(seed=int(self._seeds[index]))
-        self._last[index] = {"observation": np.array(observation, np.float32)}
+    def _numbers(self, **values: Any) -> dict[str, np.ndarray]:
+        """Copies as float32, as some environments reuse their arrays."""
+        found = {key: np.array(value, np.float32) for key, value in values.items()}
+        for key, value in found.items():
+            if not np.isfinite(value).all():
+                raise ValueError(f"task.id: {self.scenario.id} gave {key}={value}.")
+        return found
 
-    def _step_one(self, index: int, action: np.ndarray) -> None:
-        if self._last[index].get("done"):
-            return
-        self._actions[index].append(action)
+    def _start(self, index: int, seed: int) -> dict[str, Any]:
+        observation, _ = self.envs[index].reset(seed=seed)
+        return self._numbers(observation=observation)
+
+    def _advance(self, index: int, action: np.ndarray) -> dict[str, Any]:
         observation, reward, terminated, truncated, info = self.envs[index].step(action)
         truncated = truncated or len(self._actions[index]) >= self.horizon
-        self._last[index] = {
-            "observation": np.array(observation, np.float32),  # a copy: some reuse their array
-            "reward": np.array([reward], np.float32),
-            "cost": np.array([info[_COST]], np.float32),
-            "terminated": np.array([terminated], bool),
-            "truncated": np.array([truncated], bool),
-            "done": np.array([terminated or truncated], bool),
-        }
-
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
-        reset = self._reset_mask(tensordict)
-        self._seeds = torch.where(
-            reset, self._next_seeds(tensordict, reset), self._seeds.to(reset.device)
-        ).cpu()
-        for index in reset.nonzero().flatten().tolist():
-            self._reset_one(index)
-        return self._stack(("observation",))
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        for index, action in enumerate(tensordict.get("action").cpu().numpy()):
-            self._step_one(index, action.copy())
-        return self._stack(("observation", "reward", "cost", "terminated", "truncated", "done"))
-
-    def state_dict(self, *args, **kwargs) -> dict[str, Tensor]:
-        """Seeds, and the actions of the running episodes."""
-        state = {"stream": self._stream, "episode": self._episode, "seeds": self._seeds}
-        size = self.action_spec.shape[-1]
-        for index, actions in enumerate(self._actions):
-            state[f"actions_{index}"] = torch.from_numpy(
-                np.stack(actions) if actions else np.zeros((0, size), np.float32)
-            )
-        return state
-
-    def load_state_dict(self, state_dict: dict[str, Tensor], *args, **kwargs) -> None:
-        """Replay the running episodes up to where :meth:`state_dict` was taken."""
-        self._stream = state_dict["stream"].to(self.device or "cpu").clone()
-        self._episode = state_dict["episode"].to(self.device or "cpu").clone()
-        self._seeds = state_dict["seeds"].cpu().clone()
-        for index in range(len(self.envs)):
-            self._reset_one(index)
-            for action in state_dict[f"actions_{index}"].cpu().numpy():
-                self._step_one(index, action.copy())
+        ends = {"terminated": terminated, "truncated": truncated, "done": terminated or truncated}
+        numbers = self._numbers(observation=observation, reward=[reward], cost=[info[_COST]])
+        return {**numbers, **{key: np.array([end], bool) for key, end in ends.items()}}
 
     def close(self, **kwargs) -> None:
         for env in self.envs:
@@ -215,8 +189,11 @@ class _Cost(gymnasium.Wrapper):
         elif self.key in info:
             value = info[self.key]
         else:
-            raise KeyError(
+            raise ValueError(
                 f"task.cost_key: info has no {self.key!r}, it has {sorted(info)}; "
                 "null makes every cost 0."
             )
-        return observation, reward, terminated, truncated, {**info, _COST: float(value)}
+        number = np.asarray(value)
+        if number.size != 1 or number.dtype.kind not in "biuf":
+            raise ValueError(f"task.cost_key: a cost must be one number, got {value!r}.")
+        return observation, reward, terminated, truncated, {**info, _COST: float(number.item())}

@@ -5,6 +5,9 @@ No generator is shared: what happens in an episode follows from its own 31-bit s
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -50,9 +53,14 @@ class SeededEnv(EnvBase):
         num_envs: B.
         device: of the tensors.
 
+    Attributes:
+        kept: names of the tensors that are its state.
+
     Raises:
         ValueError: ``num_envs`` is less than one.
     """
+
+    kept: tuple[str, ...] = ("_stream", "_episode")
 
     def __init__(self, num_envs: int, device=None):
         if num_envs < 1:
@@ -89,3 +97,79 @@ class SeededEnv(EnvBase):
         if mask is None:
             return torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
         return mask.reshape(self.batch_size)
+
+    def state_dict(self, *args, **kwargs) -> dict[str, Tensor]:
+        return {name.lstrip("_"): getattr(self, name) for name in self.kept}
+
+    def load_state_dict(self, state_dict: dict[str, Tensor], *args, **kwargs) -> None:
+        for name in self.kept:
+            value = state_dict[name.lstrip("_")]
+            setattr(self, name, value.to(self.device or "cpu").clone())
+
+
+class ReplayedEnv(SeededEnv):
+    """A batch of environments that are stepped one by one, and whose episodes follow from seed and actions.
+
+    An episode that has ended stands still until its reset, so that playing a batch to its last end costs
+    nothing more. The state is the seeds and the actions of the running episodes, which are played again. A
+    subclass calls :meth:`_make_ends`, then :meth:`_make_memory`, and defines :meth:`_start`, :meth:`_advance`
+    and :meth:`_stack`.
+    """
+
+    def _make_memory(self) -> None:
+        count = self.batch_size[0]
+        self._seeds = torch.zeros(count, dtype=torch.int64)
+        self._actions: list[list[np.ndarray]] = [[] for _ in range(count)]
+        self._last: list[dict[str, Any]] = [{} for _ in range(count)]
+
+    def _start(self, index: int, seed: int) -> dict[str, Any]:
+        """What an environment shows at the start of its episode ``seed``, by key, without batch dimension."""
+        raise NotImplementedError
+
+    def _advance(self, index: int, action: np.ndarray) -> dict[str, Any]:
+        """What it shows after an action [A], with reward, cost and ends."""
+        raise NotImplementedError
+
+    def _stack(self, ended: bool) -> TensorDictBase:
+        """The last of each environment [B, ...], with reward, cost and ends after a step."""
+        raise NotImplementedError
+
+    def _reset_one(self, index: int) -> None:
+        self._actions[index] = []
+        self._last[index] = self._start(index, int(self._seeds[index]))
+
+    def _step_one(self, index: int, action: np.ndarray) -> None:
+        if not self._last[index].get("done"):
+            self._actions[index].append(action)
+            self._last[index] = self._advance(index, action)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+        reset = self._reset_mask(tensordict)
+        self._seeds = torch.where(
+            reset, self._next_seeds(tensordict, reset), self._seeds.to(reset.device)
+        ).cpu()
+        for index in reset.nonzero().flatten().tolist():
+            self._reset_one(index)
+        return self._stack(ended=False)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        for index, action in enumerate(tensordict.get("action").cpu().numpy()):
+            self._step_one(index, action.copy())
+        return self._stack(ended=True)
+
+    def state_dict(self, *args, **kwargs) -> dict[str, Tensor]:
+        """Seeds, and the actions of the running episodes."""
+        state = {**super().state_dict(), "seeds": self._seeds}
+        none = np.zeros((0, self.action_spec.shape[-1]), np.float32)
+        for index, actions in enumerate(self._actions):
+            state[f"actions_{index}"] = torch.from_numpy(np.stack(actions) if actions else none)
+        return state
+
+    def load_state_dict(self, state_dict: dict[str, Tensor], *args, **kwargs) -> None:
+        """Replay the running episodes up to where :meth:`state_dict` was taken."""
+        super().load_state_dict(state_dict)
+        self._seeds = state_dict["seeds"].cpu().clone()
+        for index in range(self.batch_size[0]):
+            self._reset_one(index)
+            for action in state_dict[f"actions_{index}"].cpu().numpy():
+                self._step_one(index, action.copy())

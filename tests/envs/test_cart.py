@@ -60,6 +60,20 @@ def test_specs_and_episodes():
     assert torch.equal(again["observation"][:, 4], data["observation"][:, 4])  # of the seed alone
 
 
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"horizon": 0}, "task.horizon must be >= 1, got 0"),
+        ({"spread": -1.0}, "task.spread must be >= 0, got -1"),
+        ({"noise": float("nan")}, "task.noise must be >= 0, got nan"),
+        ({"action_dim": 2}, "task.action_dim is 1 of a cart, got 2"),
+    ],
+)
+def test_refuses(setting: dict, message: str):
+    with pytest.raises(ValueError, match=message):
+        Cart(**setting)
+
+
 def test_state_goes_on_where_it_was():
     env, other = (CartEnv(Cart(), num_envs=2, seed=seed) for seed in (0, 9))
     still = lambda td: td.set("action", torch.full((2, 1), 0.3))  # noqa: E731

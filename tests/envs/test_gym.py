@@ -38,10 +38,13 @@ def test_a_step_of_six_values_says_its_cost():
 
 def test_termination_on_the_last_step_stays_a_termination():
     """docs/pitfalls.md, 2 and 12."""
-    env = GymEnvs(GymTask("test/Walk-v0", horizon=13, kwargs={"cost": "cost"}), num_envs=1)
-    env.envs[0].unwrapped.place = np.zeros(1, np.float32)
-    data = env.rollout(30, constant(1.0), break_when_any_done=True)
-    assert bool(data["next", "truncated"][0, -1]) and data.shape[1] == 5
+    env = GymEnvs(GymTask("test/Walk-v0"), num_envs=1)
+    env.envs[0].unwrapped.far = 20.0 - 1e-3
+    env.reset()
+    env.envs[0].unwrapped.place[:] = 0.0
+    for _ in range(5):
+        env._step_one(0, np.ones(1, np.float32))
+    assert env._last[0]["terminated"] and env._last[0]["truncated"] and len(env._actions[0]) == 5
 
 
 def test_seeds_decide_episodes_and_state_replays_them():
@@ -68,6 +71,10 @@ def test_seeds_decide_episodes_and_state_replays_them():
         (GymTask("test/Nowhere-v0"), "task.id: test/Nowhere-v0 cannot be made"),
         (GymTask("no_such_module:Walk-v0"), "cannot be made: No module named 'no_such_module'"),
         (GymTask("CartPole-v1"), "must have actions in a bounded box .*Discrete"),
+        (GymTask("test/Whole-v0"), "bounded box .A. of floats, got Box.*int32"),
+        (GymTask("test/Walk-v0", kwargs={"prize": 1}), "cannot be made: .*'prize'"),
+        (GymTask("test/Walk-v0", size=99), "task.size is 2 in test/Walk-v0, got 99"),
+        (GymTask("test/Walk-v0", action_dim=7), "task.action_dim is 1 in test/Walk-v0, got 7"),
         (GymTask("test/Six-v0"), "task.horizon must be given: test/Six-v0 has no time limit"),
     ],
 )
@@ -78,7 +85,53 @@ def test_refuses(task: GymTask, message: str):
 
 def test_a_missing_cost_is_named():
     env = GymEnvs(GymTask("test/Walk-v0", cost_key="collision"), num_envs=1)
-    with pytest.raises(KeyError, match=r"task.cost_key: info has no 'collision', it has \['cost'"):
+    with pytest.raises(
+        ValueError, match=r"task.cost_key: info has no 'collision', it has \['cost'"
+    ):
         env.rollout(1, constant(0.0))
     free = GymEnvs(GymTask("test/Walk-v0", cost_key=None), num_envs=1)
     assert free.rollout(2, constant(1.0))["next", "cost"].eq(0).all()
+
+
+@pytest.mark.parametrize("name", ["test/Six-v0", "test/SixLimited-v0"])
+def test_six_values_under_a_time_limit(name: str):
+    """Which gymnasium's own wrapper would not pass on."""
+    env = GymEnvs(GymTask(name, horizon=None if "Limited" in name else 3), num_envs=1)
+    assert env.rollout(9, constant(0.0)).shape[1] == 3
+
+
+def test_a_horizon_shortens_episodes_and_never_lengthens_them():
+    assert GymTask("test/Walk-v0", horizon=3).complete()["horizon"] == 3
+    assert GymTask("test/Walk-v0", horizon=30).complete()["horizon"] == 5
+    with pytest.raises(ValueError, match="task.horizon must be null or >= 1, got 0"):
+        GymTask("test/Walk-v0", horizon=0)
+
+
+@pytest.mark.parametrize(
+    ("cost", "message"),
+    [
+        (None, "a cost must be one number, got None"),
+        ([1.0, 2.0], "a cost must be one number, got .1.0, 2.0."),
+        ("much", "a cost must be one number, got 'much'"),
+        (float("nan"), "test/Walk-v0 gave cost=.nan."),
+    ],
+)
+def test_what_is_no_cost(cost, message: str):
+    env = GymEnvs(GymTask("test/Walk-v0"), num_envs=1)
+    env.envs[0].unwrapped.priced = lambda speed: cost
+    with pytest.raises(ValueError, match=message):
+        env.rollout(1, constant(0.0))
+
+
+def test_a_cost_in_an_array_of_one():
+    env = GymEnvs(GymTask("test/Walk-v0"), num_envs=1)
+    env.envs[0].unwrapped.priced = lambda speed: np.array([[2]])
+    assert env.rollout(1, constant(0.0))["next", "cost"].item() == 2.0
+
+
+def test_an_observation_that_is_no_number():
+    env = GymEnvs(GymTask("test/Walk-v0"), num_envs=1)
+    env.reset()
+    env.envs[0].unwrapped.place[:] = np.nan
+    with pytest.raises(ValueError, match="test/Walk-v0 gave observation=.*nan"):
+        env._advance(0, np.zeros(1, np.float32))

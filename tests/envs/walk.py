@@ -14,7 +14,8 @@ class Walk(gymnasium.Env):
         place=gymnasium.spaces.Box(-np.inf, np.inf, (1,)), time=gymnasium.spaces.Box(0, 99, (1,))
     )
     action_space = gymnasium.spaces.Box(-2.0, 4.0, (1,), np.float32)
-    values = 5
+    values, far = 5, 50.0
+    priced = staticmethod(np.float64)
 
     def __init__(self, cost: str = "cost"):
         self.cost, self.place, self.time = cost, np.zeros(1, np.float32), 0
@@ -30,14 +31,14 @@ class Walk(gymnasium.Env):
     def step(self, action):
         self.place += action
         self.time += 1
-        ended = bool(self.place[0] > 50)
+        ended = bool(self.place[0] > self.far)
         speed = float(abs(action[0]))
         values = [
             self._observe(),
             float(self.place[0]),
             ended,
             False,
-            {self.cost: np.float64(speed)},
+            {self.cost: self.priced(speed)},
         ]
         if self.values == 6:
             values.insert(2, 2 * speed)
@@ -48,6 +49,12 @@ class SixValues(Walk):
     values = 6
 
 
+class Whole(Walk):
+    action_space = gymnasium.spaces.Box(-2, 2, (1,), np.int32)
+
+
+gymnasium.register("test/Whole-v0", Whole, max_episode_steps=5)
+gymnasium.register("test/SixLimited-v0", SixValues, max_episode_steps=3)
 gymnasium.register("test/Walk-v0", Walk, max_episode_steps=5)
 gymnasium.register("test/Six-v0", SixValues)
 

@@ -1,0 +1,213 @@
+"""From a Hydra configuration to an agent: networks, loss and projector."""
+
+from __future__ import annotations
+
+import inspect
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import hydra
+import torch
+from omegaconf import DictConfig
+from tensordict.nn import TensorDictModuleBase
+from torchrl.objectives import LossModule, ValueEstimators
+
+from saferl.checkpoint import latest, load_component, run_config
+from saferl.components import Fitting, Networks
+from saferl.envs.transforms import SafetyProjector
+from saferl.modules import StateValue, tanh_gaussian_actor, value_operator, zero_output
+
+
+def device_of(cfg: DictConfig) -> torch.device:
+    """The configured device; ``auto`` is a GPU where there is one.
+
+    Raises:
+        ValueError: an unknown device, or CUDA without a GPU.
+    """
+    name = cfg.device
+    if name not in ("auto", "cpu", "cuda"):
+        raise ValueError(f"device must be one of auto, cpu, cuda, got {name!r}.")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ValueError("device=cuda, but torch sees no GPU; use device=cpu or auto.")
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    return torch.device(name)
+
+
+def make(node: DictConfig, **objects: Any) -> Any:
+    """Instantiate a node with live objects, which Hydra itself would turn into configurations."""
+    return hydra.utils.instantiate(node, _partial_=True)(**objects)
+
+
+@dataclass
+class Agent:
+    """Networks and loss of one composition.
+
+    Attributes:
+        actor: the policy.
+        loss: owns the live parameters of all networks, targets, temperature and multiplier.
+        projector: a :class:`SafetyProjector` on the loss's live cost critics, or None.
+    """
+
+    actor: TensorDictModuleBase
+    loss: LossModule
+    projector: SafetyProjector | None
+
+
+def observed(cfg: DictConfig) -> tuple[str, ...]:
+    """Keys of what the configured task observes."""
+    return ("observation",) if "size" in cfg.task else ("ego", "vehicles")
+
+
+def _takes(cfg: DictConfig) -> set[str]:
+    """Names of what the configured loss is built from."""
+    return set(inspect.signature(hydra.utils.get_object(cfg.loss._target_)).parameters)
+
+
+def on_policy(cfg: DictConfig) -> bool:
+    """Whether the configured loss has state values, and so learns from fresh transitions alone."""
+    return "critic_network" in _takes(cfg)
+
+
+def _check_parts(cfg: DictConfig) -> None:
+    """Refuse parts that do not go together."""
+    takes, loss = _takes(cfg), cfg.loss._target_
+    fresh = "critic_network" in takes
+    parts = {
+        "cost_critic": cfg.cost_critic.members > 0,
+        "lagrange": cfg.lagrange.multiplier is not None,
+    }
+    for name, present in parts.items():
+        if present and name not in takes:
+            raise ValueError(f"{loss} takes no {name}: set {name}=none, or loss=sac_lag.")
+        if name in takes and not present:
+            raise ValueError(f"{loss} needs {name}, got {name}=none.")
+    if cfg.projector._target_ is not None and (fresh or "cost_critic" not in takes):
+        raise ValueError(
+            f"projector needs cost critics Q_c(s, a), which {loss} has not: "
+            "set projector=none, or loss=sac_lag."
+        )
+    for name in ("critic", "cost_critic"):
+        if fresh and cfg[name].members > 1:
+            raise ValueError(
+                f"{loss} has one state value: set {name}=single, got {cfg[name].members} members."
+            )
+
+
+def build_agent(cfg: DictConfig) -> Agent:
+    """Networks, loss and projector, on the configured device.
+
+    Raises:
+        ValueError: parts that do not go together.
+    """
+    _check_parts(cfg)
+    device, takes, keys = device_of(cfg), _takes(cfg), observed(cfg)
+    width, action_dim = cfg.encoder.policy.width, cfg.task.get("action_dim", 2)
+
+    def policy_encoder() -> torch.nn.Module:
+        return hydra.utils.instantiate(cfg.encoder.policy)
+
+    def action_values(critics: DictConfig) -> list[torch.nn.Module]:
+        # Only what differs, so that an encoder need not know of options that it is not asked for.
+        asked = {"outputs": critics.get("outputs", 1), "layer_norm": critics.get("layer_norm")}
+        options = {key: value for key, value in asked.items() if value not in (1, False, None)}
+        return [
+            hydra.utils.instantiate(cfg.encoder.value, **options).to(device)
+            for _ in range(critics.members)
+        ]
+
+    def state_value(out_key: str) -> torch.nn.Module:
+        network = StateValue(policy_encoder(), width).to(device)
+        return value_operator(network, in_keys=keys, out_key=out_key)
+
+    def action_value(network: torch.nn.Module, out_key: str) -> torch.nn.Module:
+        return value_operator(network, in_keys=(*keys, "action"), out_key=out_key)
+
+    def alone_or_all(members: list[torch.nn.Module]) -> Any:
+        # Of a list of one TorchRL makes parameters that no optimizer sees.
+        return members[0] if len(members) == 1 else members
+
+    def cost_critic() -> Any:
+        if on_policy(cfg):
+            return state_value("state_cost_value")
+        # At 0, or a projector would correct every action before the first cost was seen.
+        return alone_or_all(
+            [
+                action_value(zero_output(network), "state_action_cost_value")
+                for network in action_values(cfg.cost_critic)
+            ]
+        )
+
+    encoder = policy_encoder()
+    wanted: Any = encoder.in_keys
+    if tuple(wanted) != keys:
+        raise ValueError(
+            f"{cfg.encoder.policy._target_} reads {', '.join(wanted)}, but task={cfg.task.task} observes "
+            f"{', '.join(keys)}: set encoder=mlp, or an algorithm without attention (rsac, sac, ...)."
+        )
+    actor = tanh_gaussian_actor(encoder, width, action_dim, keys).to(device)
+    parts = {
+        "actor_network": lambda: actor,
+        "qvalue_network": lambda: alone_or_all(
+            [action_value(network, "state_action_value") for network in action_values(cfg.critic)]
+        ),
+        "num_qvalue_nets": lambda: cfg.critic.members,
+        "critic_network": lambda: state_value("state_value"),
+        "cost_critic": cost_critic,
+        "num_cost_critics": lambda: cfg.cost_critic.members,
+        "lagrange": lambda: hydra.utils.instantiate(cfg.lagrange.multiplier),
+        "target_entropy": lambda: cfg.target_entropy,
+        "alpha_init": lambda: cfg.alpha_init,
+    }
+    loss = make(cfg.loss, **{k: part() for k, part in parts.items() if k in takes}).to(device)
+    if on_policy(cfg):
+        loss.make_value_estimator(ValueEstimators.GAE, gamma=cfg.gamma, lmbda=cfg.gae_lambda)
+    else:
+        loss.make_value_estimator(gamma=cfg.gamma)
+    projector = None
+    if cfg.projector._target_ is not None:
+        projector = make(cfg.projector, risk=loss.cost_value)
+    return Agent(actor, loss, projector)
+
+
+def load_agent(cfg: DictConfig, path: Path, name: str) -> Agent:
+    """The agent of a run or checkpoint as it was; ``name`` is the option that gave it.
+
+    Raises:
+        FileNotFoundError: there is no checkpoint.
+        ValueError: the checkpoint is of another architecture.
+    """
+    agent = build_agent(cfg)
+    load_component(latest(path, name), Fitting(agent.loss))
+    return agent
+
+
+def _architecture(cfg: DictConfig) -> dict[str, Any]:
+    """What decides whether the networks of two configurations fit, by option."""
+    encoder = {f"encoder.policy.{key}": value for key, value in cfg.encoder.policy.items()}
+    encoder.pop("encoder.policy.rows", None)  # it follows task.rows
+    return {"algo_name": cfg.algo_name, "task.rows": cfg.task.rows, **encoder}
+
+
+def begin_from(agent: Agent, cfg: DictConfig, path: Path) -> None:
+    """Give an agent the networks of another run; all else stays as ``cfg`` says.
+
+    Raises:
+        FileNotFoundError: there is no checkpoint.
+        ValueError: another architecture; names the options that differ.
+    """
+    try:
+        load_component(latest(path, "init"), Networks(agent.loss))
+    except ValueError as error:
+        ours, theirs = _architecture(cfg), _architecture(run_config(path, "init"))
+        differing = [
+            f"{key} is {theirs[key]} there and {value} here"
+            for key, value in ours.items()
+            if key in theirs and theirs[key] != value
+        ]
+        if not differing:
+            raise
+        raise ValueError(
+            f"init: the networks of {path} do not fit: {', '.join(differing)}."
+        ) from error
