@@ -81,6 +81,8 @@ def train(overrides: list[str]) -> dict:
                 watch.wrap(transform, "_inv_call", "project")
         watch.wrap(trainer.learner, "update", "learn")
         watch.wrap(trainer.experience.buffer, "sample", "learn")
+        if hasattr(trainer.experience, "begin"):  # of an on-policy algorithm
+            watch.wrap(trainer.experience, "begin", "learn")
         trainer.train()
     wall = time.perf_counter() - begin
     watch.seconds["other"] = wall - sum(watch.seconds.values())

@@ -72,15 +72,14 @@ def on_policy(cfg: DictConfig) -> bool:
 
 def _check_parts(cfg: DictConfig) -> None:
     """Refuse parts that do not go together."""
-    takes, loss = _takes(cfg), cfg.loss._target_
-    fresh = "critic_network" in takes
+    takes, fresh, loss = _takes(cfg), on_policy(cfg), cfg.loss._target_
     parts = {
         "cost_critic": cfg.cost_critic.members > 0,
         "lagrange": cfg.lagrange.multiplier is not None,
     }
     for name, present in parts.items():
         if present and name not in takes:
-            raise ValueError(f"{loss} takes no {name}: set {name}=none, or loss=sac_lag.")
+            raise ValueError(f"{loss} takes no {name}: set {name}=none, or another loss.")
         if name in takes and not present:
             raise ValueError(f"{loss} needs {name}, got {name}=none.")
     if cfg.projector._target_ is not None and (fresh or "cost_critic" not in takes):
@@ -186,8 +185,10 @@ def load_agent(cfg: DictConfig, path: Path, name: str) -> Agent:
 def _architecture(cfg: DictConfig) -> dict[str, Any]:
     """What decides whether the networks of two configurations fit, by option."""
     encoder = {f"encoder.policy.{key}": value for key, value in cfg.encoder.policy.items()}
-    encoder.pop("encoder.policy.rows", None)  # it follows task.rows
-    return {"algo_name": cfg.algo_name, "task.rows": cfg.task.rows, **encoder}
+    for follows in ("rows", "size"):  # the task
+        encoder.pop(f"encoder.policy.{follows}", None)
+    task = {f"task.{key}": cfg.task.get(key) for key in ("rows", "size", "action_dim")}
+    return {"algo_name": cfg.algo_name, **task, **encoder}
 
 
 def begin_from(agent: Agent, cfg: DictConfig, path: Path) -> None:
@@ -197,17 +198,18 @@ def begin_from(agent: Agent, cfg: DictConfig, path: Path) -> None:
         FileNotFoundError: there is no checkpoint.
         ValueError: another architecture; names the options that differ.
     """
+    found, theirs = latest(path, "init"), _architecture(run_config(path, "init"))
+    differing = {
+        key: f"{key} is {theirs[key]} there and {value} here"
+        for key, value in _architecture(cfg).items()
+        if key in theirs and theirs[key] != value
+    }
+    error = f"init: the networks of {path} do not fit: {', '.join(differing.values())}."
+    if any(key.startswith("encoder.") for key in differing):  # an activation has no shape
+        raise ValueError(error)
     try:
-        load_component(latest(path, "init"), Networks(agent.loss))
-    except ValueError as error:
-        ours, theirs = _architecture(cfg), _architecture(run_config(path, "init"))
-        differing = [
-            f"{key} is {theirs[key]} there and {value} here"
-            for key, value in ours.items()
-            if key in theirs and theirs[key] != value
-        ]
+        load_component(found, Networks(agent.loss))
+    except ValueError as reason:
         if not differing:
             raise
-        raise ValueError(
-            f"init: the networks of {path} do not fit: {', '.join(differing)}."
-        ) from error
+        raise ValueError(error) from reason

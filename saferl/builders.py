@@ -151,6 +151,11 @@ def build_experience(cfg: DictConfig, agent: Agent, scenario: Any) -> Replay | E
     if fresh:
         loss: Any = agent.loss
         frames = cfg.collector.frames_per_env * cfg.env.num_envs
+        if cfg.batch_size > frames:
+            raise ValueError(
+                f"batch_size must be <= {frames}, the frames of a batch from one policy (collector=rollout, "
+                f"rollout_frames), got {cfg.batch_size}."
+            )
         # TorchRL's own losses leave their advantages to their estimator.
         begin = getattr(loss, "begin", None) or partial(
             loss.value_estimator,
@@ -159,7 +164,8 @@ def build_experience(cfg: DictConfig, agent: Agent, scenario: Any) -> Replay | E
         )
         buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(frames, device=device),
-            sampler=SamplerWithoutReplacement(),
+            # Without the rest of an epoch: a small batch would weigh as much as a whole one.
+            sampler=SamplerWithoutReplacement(drop_last=True),
             batch_size=cfg.batch_size,
             generator=generator,
         )

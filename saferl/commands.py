@@ -100,11 +100,20 @@ def claim(run: Path, cfg: DictConfig) -> None:
 
 def evaluate(cfg: DictConfig) -> None:
     """Test a policy that the configuration names, and draw its first episodes."""
+    if not _is_road(cfg.task):
+        raise ValueError(
+            f"task={cfg.task.task}: task= of a test is one of the road's; a policy that was trained on another task "
+            "is tested there without it."
+        )
     check_testing(cfg)
     torch.set_num_threads(cfg.threads)
     OmegaConf.resolve(cfg)
     cfg, policy, transforms, name = choose_policy(cfg)
     scenario = hydra.utils.instantiate(cfg.task)
+    if cfg.gif and not isinstance(scenario, Scenario):
+        raise ValueError(
+            f"gif: pictures are of the road, and this policy's task is {cfg.task.task}."
+        )
     about = f"{name.partition(' ')[0]}-{scenario.task}-seed{cfg.seed}"
     folder = f"evaluation/{about}/{datetime.now():%Y-%m-%d_%H-%M-%S-%f}"
     out = Path(folder if cfg.out is None else str(cfg.out))
@@ -164,6 +173,11 @@ def trained_policy(cfg: DictConfig, path: Path) -> tuple[TensorDictModuleBase, l
     return agent.actor, [agent.projector]
 
 
+def _is_road(task: DictConfig) -> bool:
+    """Whether a task is of the intersection."""
+    return "rows" in task
+
+
 def on_its_own_task(cfg: DictConfig, trained: DictConfig, overrides: Sequence[str]) -> DictConfig:
     """A test's configuration with the task and environment that a policy was trained with.
 
@@ -172,8 +186,16 @@ def on_its_own_task(cfg: DictConfig, trained: DictConfig, overrides: Sequence[st
         trained: the run's configuration.
         overrides: the command line; what it says of task and environment stands. Of a choice
             ``task=lt`` only the name counts.
+
+    Raises:
+        ValueError: the command line changes the task of a policy that was not trained on the road.
     """
     keys = [override.partition("=")[0].lstrip("+") for override in overrides]
+    given = [key for key in keys if key.partition(".")[0] in ("task", "env")]
+    if given and not _is_road(trained.task) and given != ["env.num_envs"]:
+        raise ValueError(
+            f"{given[0]}: this policy's task is {trained.task.task}, which a test does not change."
+        )
     test = cfg.copy()
     OmegaConf.set_struct(test, False)
     changes = TEST | {"policy_frequency": trained.evaluation.policy_frequency}

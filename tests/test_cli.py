@@ -57,12 +57,23 @@ MISTAKES = [
     (TRAIN, "env.num_envs=abc", "env.num_envs must be a whole number, got 'abc'"),
     (TRAIN, "encoder.policy.heads=3", "width must be a multiple of heads, got 256 and 3"),
     (TRAIN, "lagrange.multiplier.lr=-1", "lr must be finite and > 0, got -1"),
-    (TRAIN, "loss=sac", "takes no cost_critic: set cost_critic=none, or loss=sac_lag"),
+    (TRAIN, "loss=sac", "takes no cost_critic: set cost_critic=none, or another loss"),
     (TRAIN, "algo=sac loss=sac_lag", "needs cost_critic, got cost_critic=none"),
     (TRAIN, "algo=sac projector=gradient", "projector needs cost critics"),
     (TRAIN, "algo=cpo projector=gradient", "projector needs cost critics Q_c(s, a), which"),
     (TRAIN, "algo=cpo lagrange=episode", "takes no lagrange: set lagrange=none"),
     (TRAIN, "algo=cpo experience=replay", "learns from experience=epochs, got"),
+    (
+        TRAIN,
+        "algo=ppo task=cart rollout_frames=100",
+        "batch_size must be <= 128, the frames of a batch",
+    ),
+    (TRAIN, "algo=ppo collector=sync env.num_envs=9", "batch_size must be <= 9, the frames of a"),
+    (TRAIN, "algo=ppo_lag +loss.clip_epsilom=0.3", "unknown key loss.clip_epsilom"),
+    (TRAIN, "algo=cpo +loss.dampin=3", "unknown key loss.dampin"),
+    (TRAIN, "algo=cpo loss.trust=abc", "loss.trust must be a number, got 'abc'"),
+    (TRAIN, "task=cart task.horizon=0", "task.horizon must be >= 1, got 0"),
+    (TEST, "policy=random task=cart", "task=cart: task= of a test is one of the road's"),
     (TRAIN, "algo=ppo critic=twin", "has one state value: set critic=single, got 2 members"),
     (TRAIN, "algo=ppo_lag lagrange=signed", "CriticSignal needs Q_c(s, a), which PPOLagLoss has"),
     (TRAIN, "env=cart", "plays a Cart, but task=gs is a Scenario: leave env= to the task"),
@@ -156,6 +167,40 @@ def test_init_begins_from_the_networks_alone(algo: str, run: Path, tmp_path: Pat
     assert ours["_value_estimator.gamma"] == 0.5
     assert algo == "sac" or ours["cost_limit"] == pytest.approx(0.3)
     assert trainer.progress.frames == 0 and trainer.collector.init_random_frames == 0
+
+
+def test_init_among_on_policy_algorithms(tmp_path: Path, refusal):
+    """Both values are taken over; weights that were trained with another activation are not."""
+    first = tmp_path / "first"
+    cfg = compose(*SMALL, "algo=ppo_lag", "task=cart")
+    build_trainer(cfg, first).train()
+    OmegaConf.save(cfg, first / CONFIG, resolve=True)
+    theirs = load_agent(run_config(first), first, "x").loss.state_dict()
+    options = ("algo=cpo", "encoder=mlp_tanh", "task=cart", "seed=9", f"init={first}")
+    ours = build_trainer(compose(*SMALL, *options), tmp_path / "x").learner.loss.state_dict()
+    networks = [key for key in ours if "_params." in key and "target_" not in key]
+    assert {key.split(".")[0] for key in networks} == {
+        "actor_network_params", "critic_network_params", "cost_critic_params"
+    }  # fmt: skip
+    for key in networks:
+        assert not isinstance(ours[key], torch.Tensor) or torch.equal(ours[key], theirs[key]), key
+    for algo in ("cpo", "sac"):
+        line = refusal(*TRAIN, *SMALL, f"algo={algo}", "task=cart", f"init={first}")
+        assert "do not fit: algo_name is ppo_lag there" in line and "torch.nn.Tanh" in line
+
+
+def test_a_test_does_not_change_a_task_that_is_not_the_roads(tmp_path: Path, refusal):
+    run = tmp_path / "run"
+    cfg = compose(*SMALL, "algo=sac", "task=cart")
+    build_trainer(cfg, run).save()
+    OmegaConf.save(cfg, run / CONFIG, resolve=True)
+    for option, words in (
+        ("task=lt", "task: this policy's task is cart, which a test does not change"),
+        ("task.scenario=dense", "task.scenario: this policy's task is cart"),
+        ("gif=1", "gif: pictures are of the road, and this policy's task is cart"),
+    ):
+        assert words in refusal(*TEST, f"checkpoint={run}", option, "episodes=2", "out=test")
+    assert not (tmp_path / "test").exists()
 
 
 def test_init_of_another_algorithm(run: Path, tmp_path: Path, refusal):

@@ -82,6 +82,24 @@ def test_demonstrations_fill_the_buffer_before_the_first_frame(tmp_path: Path):
         assert torch.equal(stored[key][: len(shown)], shown[key])
 
 
+@pytest.mark.parametrize("algo", ["sac", "ppo"])
+def test_the_papers_order_with_and_without_a_temperature(algo: str, tmp_path: Path):
+    """What has no temperature has no stage for one."""
+    options = (f"algo={algo}", "update_order=sequential", "rollout_frames=8")
+    trainer = trainer_of(tmp_path, *options, "env.num_envs=4")
+    trainer.train()
+    assert trainer.progress.updates and len(trainer.learner.stages) == (3 if algo == "sac" else 2)
+
+
+def test_an_epoch_leaves_its_rest(tmp_path: Path):
+    """A few samples would weigh as much as a whole mini-batch, and be standardised by themselves."""
+    trainer = trainer_of(tmp_path, "algo=ppo", "rollout_frames=20", "batch_size=8")
+    batches = list(trainer.experience.batches(next(iter(trainer.collector)), 20))
+    assert [len(batch) for batch in batches] == [8, 8] * 10
+    rows = torch.cat([batch["action"] for batch in batches[:2]])
+    assert len(rows.unique(dim=0)) == 16
+
+
 def test_threads_are_as_many_as_are_asked_for(tmp_path: Path):
     """Two by default, not all that a machine has (docs/pitfalls.md, 14)."""
     assert compose().threads == 2
