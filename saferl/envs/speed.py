@@ -12,7 +12,7 @@ from typing import Any
 
 import gymnasium
 
-#: gymnasium's running tasks, and a speed in m/s that a trained runner exceeds.
+#: gymnasium's running tasks, and the default limit of each, m/s.
 RUNNERS = {"HalfCheetah": 1.0, "Hopper": 0.5, "Walker2d": 0.5, "Swimmer": 0.05, "Ant": 0.5}
 
 

@@ -50,8 +50,7 @@ class CPOLoss(CostValueLoss, PPOLoss):
     the policy, and :math:`c = (J_c - d) / w` the violation *per decision*: g and b are means over decisions,
     and :math:`J_c(\pi') - J_c(\pi)` is to first order :math:`w = \sum_{t<L} \gamma^t` times such a mean, L an
     episode's mean length over the last batches. :math:`J_c` is the discounted cost of an episode from its start
-    to its end, by termination or truncation; ``gamma=1`` makes it the plain sum. Without that division the
-    constraint is some hundred times too strict or too loose, and the quadratic cases never occur.
+    to its end, by termination or truncation.
 
     The step is shortened by ``backtrack`` until the KL is within delta, the surrogate does not get worse, and
     the cost's surrogate does not rise above its limit (above where it was, from an infeasible start); if none

@@ -64,12 +64,11 @@ class SACLagLoss(CostCriticLoss, SACLoss):
             unit of ``cost``. Defaults to ``0.05``.
         cost_target ("max" or "mean", optional): what :math:`Q_c^-` is of the members of
             the target. Defaults to ``"max"`` (paper), whose overestimate feeds itself.
-        cost_backup ("sum" or "reach", optional): what the cost critics learn, the discounted sum of
-            costs (paper) or the discounted largest one ahead, a reachability. Defaults to ``"sum"``.
-        risk (callable, optional): what :math:`Q_c(s, \tilde a)` is of the members' values
-            ``[n, *B, K]``. Defaults to :class:`~saferl.modules.Largest` (paper).
-        rescale (bool, optional): divide the actor's loss by :math:`1 + \lambda`, so that its size does
-            not grow with the multiplier. Defaults to ``False`` (paper).
+        cost_backup ("sum" or "reach", optional): what the cost critics learn, the discounted sum of costs
+            (paper) or the largest one ahead. Defaults to ``"sum"``.
+        risk (callable, optional): what :math:`Q_c(s, \tilde a)` is of the members' values ``[n, *B, K]``.
+            Defaults to :class:`~saferl.modules.Largest` (paper).
+        rescale (bool, optional): divide the actor's loss by :math:`1 + \lambda`. Defaults to ``False`` (paper).
         num_qvalue_nets (int, optional): reward critics. Defaults to ``2``.
         num_cost_critics (int, optional): cost critics. Defaults to ``2``.
         delay_qvalue (bool, optional): keep target copies of both kinds of
@@ -205,8 +204,7 @@ class SACLagLoss(CostCriticLoss, SACLoss):
             compare_against=list(actor_network.parameters()) if separate_losses else None,
         )
         self.rescale = rescale
-        # Resolved now rather than in the first forward, which would break a compiled graph.
-        _ = self.target_entropy
+        _ = self.target_entropy  # now, as its first look-up would break a compiled graph
         self.out_keys = [*_LOSSES, "constraint_violation"]
         if self.reduction != "none" or self.scalar_output_mode == "non_tensor":
             self.out_keys += _SCALARS
