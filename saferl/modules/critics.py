@@ -278,7 +278,11 @@ class CriticEnsemble(TensorDictModuleBase):
                     raise ValueError(
                         f"All critics must use the same keys, got {ours} and {theirs}."
                     )
-            self.params = TensorDict.from_modules(*members, as_module=True, expand_identical=True)
+            # Of a single member expanded parameters would be no leaves, which no optimizer sees.
+            several = len(members) > 1
+            self.params = TensorDict.from_modules(
+                *members, as_module=True, expand_identical=several
+            )
         # Only the structure of the template is used: its own weights must not be listed.
         self.__dict__["template"] = template
         self.reduce = reduce

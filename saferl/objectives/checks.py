@@ -43,3 +43,13 @@ def check_cost(tensordict: TensorDictBase, key: NestedKey) -> None:
             f"{sorted(map(str, tensordict.get('next').keys()))}. "
             "Name your cost with loss.set_keys(cost=...)."
         )
+
+
+def check_members(name: str, members: Any) -> None:
+    """That the members of an ensemble come as TorchRL can train them.
+
+    Raises:
+        ValueError: they are a list of one, of which TorchRL makes parameters that no optimizer sees.
+    """
+    if isinstance(members, list) and len(members) == 1:
+        raise ValueError(f"{name} must be a critic or a list of several, got a list of one.")

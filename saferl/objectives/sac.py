@@ -17,10 +17,13 @@ from torchrl.objectives import SACLoss
 from torchrl.objectives.sac import compute_rsample_log_prob
 
 from saferl.modules import BoundCritics, LagrangeMultiplier
+from saferl.objectives.checks import check_members
 from saferl.objectives.cost import CostCriticLoss
 
 _LOSSES = ("loss_actor", "loss_qvalue", "loss_cost", "loss_alpha")
 _SCALARS = ("alpha", "entropy", "lagrange_multiplier")
+_CRITICS = ("qvalue_network_params", "cost_critic_params")
+_PARAMS = ("actor_network_params", *_CRITICS, *(f"target_{name}" for name in _CRITICS))
 
 
 class SACLagLoss(CostCriticLoss, SACLoss):
@@ -91,8 +94,8 @@ class SACLagLoss(CostCriticLoss, SACLoss):
         input: ``"td_error"`` ``[*B]``, the reward critics' priority.
 
     Raises:
-        ValueError: ``cost_limit`` is negative or not finite, a number of critics
-            is below one, or ``gamma`` lies outside [0, 1].
+        ValueError: ``cost_limit`` is negative or not finite, a number of critics is
+            below one, critics come as a list of one, or ``gamma`` lies outside [0, 1].
         KeyError: the batch holds no cost.
 
     Examples:
@@ -173,6 +176,8 @@ class SACLagLoss(CostCriticLoss, SACLoss):
         use_prioritized_weights: Literal["auto"] | bool = "auto",
         scalar_output_mode: Literal["exclude", "non_tensor"] | None = None,
     ) -> None:
+        check_members("qvalue_network", qvalue_network)
+        check_members("cost_critic", cost_critic)
         if num_qvalue_nets < 1:
             raise ValueError(f"num_qvalue_nets must be >= 1, got {num_qvalue_nets}.")
         super().__init__(
@@ -245,15 +250,7 @@ class SACLagLoss(CostCriticLoss, SACLoss):
                     td_out.set_non_tensor(key, value)
         else:
             td_out = TensorDict({**out, **scalars}, batch_size=[])
-        self._clear_weakrefs(
-            tensordict,
-            td_out,
-            "actor_network_params",
-            "qvalue_network_params",
-            "cost_critic_params",
-            "target_qvalue_network_params",
-            "target_cost_critic_params",
-        )
+        self._clear_weakrefs(tensordict, td_out, *_PARAMS)
         return td_out
 
     def actor_loss(

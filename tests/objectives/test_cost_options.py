@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict
 
 from saferl.modules import (
+    CriticEnsemble,
     CVaR,
     DualAscent,
     Largest,
@@ -178,6 +179,21 @@ def test_rescaled_actor_loss():
         torch.manual_seed(5)
         losses.append(loss.actor_loss(data)[0])
     torch.testing.assert_close(losses[1], losses[0] / 4.0)  # lambda is 3
+
+
+def test_one_critic_is_trained():
+    """As itself; in a list TorchRL would hide its parameters."""
+    loss = build(members=2)
+    critic = loss.cost_critic
+    with pytest.raises(
+        ValueError, match="cost_critic must be a critic or a list of several, got a list"
+    ):
+        build(members=1)
+    alone = CriticEnsemble([critic])
+    assert list(alone.parameters()) and all(p.is_leaf for p in alone.parameters())
+    state = batch_of().select("observation", "action")
+    alone(state)["state_action_cost_value"].sum().backward()
+    assert all(p.grad is not None for p in alone.parameters())
 
 
 def test_refuses():
