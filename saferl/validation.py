@@ -230,6 +230,8 @@ def fits(value: Any, kind: Any) -> bool:
         return listed and all(fits(item, inner[0]) for item in value)
     if origin is Callable:
         return callable(value)
+    if origin is type:
+        return inspect.isclass(value)
     return not is_dataclass(kind)
 
 
@@ -249,6 +251,8 @@ def describe(kind: Any) -> str:
         return f"a list{size}, each {describe(inner[0])}"
     if get_origin(kind) is Callable:
         return "a function, by its _target_"
+    if get_origin(kind) is type:
+        return "a class, by its _target_"
     if is_dataclass(kind):
         return f"a mapping of {', '.join(field.name for field in fields(kind))}"
     return _KINDS.get(kind, str(kind))
