@@ -87,6 +87,13 @@ def _check_parts(cfg: DictConfig) -> None:
             f"projector needs cost critics Q_c(s, a), which {loss} has not: "
             "set projector=none, or loss=sac_lag."
         )
+    risk = cfg.risk._target_
+    if risk != "saferl.modules.Largest" and "risk" not in takes:
+        raise ValueError(f"{loss} takes no risk, got {risk}: set risk=largest, or loss=sac_lag.")
+    if risk == "saferl.modules.CVaR" and cfg.cost_critic.get("outputs", 1) == 1:
+        raise ValueError("risk=cvar is of quantiles: set cost_critic=quantile.")
+    if risk == "saferl.modules.MeanStd" and cfg.cost_critic.members == 1:
+        raise ValueError("risk=mean_std is of several members: set cost_critic=ensemble.")
     for name in ("critic", "cost_critic"):
         if fresh and cfg[name].members > 1:
             raise ValueError(

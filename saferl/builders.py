@@ -20,6 +20,7 @@ from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import LossModule, SoftUpdate
 
 from saferl.agents import Agent, begin_from, build_agent, device_of, make, observed, on_policy
+from saferl.envs.intersection import Scenario
 from saferl.envs.intersection.drivers import CautiousDriver, Driver
 from saferl.envs.transforms import ExecutedAction
 from saferl.experience import Epochs, Replay
@@ -173,6 +174,12 @@ def build_experience(cfg: DictConfig, agent: Agent, scenario: Any) -> Replay | E
         return make(
             cfg.experience, buffer=buffer, stored=stored, begin=begin, reward_scale=cfg.reward_scale
         )
+    demonstrations = cfg.get("demonstrations")  # a run from before this setting has none
+    if demonstrations and not isinstance(scenario, Scenario):
+        raise ValueError(
+            f"demonstrations are of drivers on a road, which task={scenario.task} has not: "
+            f"set demonstrations=0, got {demonstrations}."
+        )
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(cfg.buffer_size, device=device),
         batch_size=cfg.batch_size,
@@ -187,7 +194,7 @@ def build_experience(cfg: DictConfig, agent: Agent, scenario: Any) -> Replay | E
         stored=(*keys, *STORED),
         updates_per_frame=cfg.updates_per_frame,
         warmup_frames=cfg.warmup_frames,
-        demonstrate=partial(demonstrate, cfg, scenario) if cfg.get("demonstrations") else None,
+        demonstrate=partial(demonstrate, cfg, scenario) if demonstrations else None,
     )
 
 

@@ -76,6 +76,13 @@ MISTAKES = [
     (TEST, "policy=random task=cart", "task=cart: task= of a test is one of the road's"),
     (TRAIN, "algo=ppo critic=twin", "has one state value: set critic=single, got 2 members"),
     (TRAIN, "algo=ppo_lag lagrange=signed", "CriticSignal needs Q_c(s, a), which PPOLagLoss has"),
+    (TRAIN, "algo=sac risk=mean_std", "SACLoss takes no risk, got saferl.modules.MeanStd"),
+    (TRAIN, "risk=mean_std cost_critic.members=1", "risk=mean_std is of several members"),
+    (
+        TRAIN,
+        "algo=sac_lag task=cart demonstrations=9",
+        "which task=cart has not: set demonstrations=0",
+    ),
     (TRAIN, "env=cart", "plays a Cart, but task=gs is a Scenario: leave env= to the task"),
     (TRAIN, "task=gym", "Missing mandatory value: task.id"),
     (TRAIN, "algo=sac task=gym task.id=No-v0", "task.id: No-v0 cannot be made"),
@@ -325,12 +332,13 @@ def test_interrupt_of_the_closing_test_tells_how_to_repeat_it(command, monkeypat
 
 
 def test_second_interrupt_ends_at_once(tmp_path: Path):
-    """Even while a step lasts for ever."""
+    """Even while a step lasts for ever; then the handler is what it was."""
+    before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt, match="twice"), _interrupts() as received:
         signal.raise_signal(signal.SIGINT)
         assert received == [signal.SIGINT]
         signal.raise_signal(signal.SIGINT)
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_mistake_in_a_process_of_its_own(spawn, tmp_path: Path):

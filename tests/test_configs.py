@@ -83,6 +83,7 @@ REFUSED = {
     "loss=ppo": "takes no cost_critic",
     "loss=ppo_lag": "projector needs cost critics",
     "loss=sac": "takes no cost_critic",
+    "risk=cvar": "risk=cvar is of quantiles: set cost_critic=quantile",
     "task=cart": "reads ego, vehicles, but task=cart observes observation",
     "task=gym": "reads ego, vehicles, but task=gym observes observation",
 }
