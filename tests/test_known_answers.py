@@ -39,7 +39,7 @@ def sums(policy, steps: int, gamma: float) -> tuple[float, float]:
 
 #: The problem that each states: discount of the cost in its limit, and over how many decisions.
 PROBLEMS = {
-    "cpo": (GAMMA, 20, ("loss.damping=0.01", "rollout_frames=2560", "experience.epochs=5")),
+    "cpo": (GAMMA, 20, ("loss.damping=0.01", "rollout_frames=2560", "frames=800000")),
     "ppo_lag": (1.0, 20, (f"lagrange.signal.cost_limit={LIMIT}", "experience.epochs=5")),
     "sac_lag": (1.0, 20, (f"lagrange.signal.cost_limit={LIMIT}",)),
 }
