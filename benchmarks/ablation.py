@@ -90,7 +90,13 @@ def main() -> None:
             cells = []
             for label, rate in RATES.items():
                 tests = [folders[name, seed] / f"test_{task}" for seed in options.seeds]
-                each = [json.loads((t / "metrics.json").read_text())[rate]["mean"] for t in tests]
+                measured = [json.loads((t / "metrics.json").read_text()) for t in tests]
+                for test, figure in zip(tests, measured, strict=True):
+                    if figure["episodes"] != options.episodes:
+                        raise SystemExit(
+                            f"--episodes must be {figure['episodes']}, as in {test}, got {options.episodes}"
+                        )
+                each = [figure[rate]["mean"] for figure in measured]
                 count = options.episodes * len(each)
                 low, high = wilson(round(sum(each) * options.episodes), count)
                 seeds = ", ".join(f"{100 * value:.1f}" for value in each)

@@ -115,8 +115,9 @@ class StraightSACLag:
         self.alpha_optimizer = torch.optim.Adam([self.log_alpha], lr=ALPHA_LR, fused=True)
 
         if compile:
-            self.critic_loss = torch.compile(self.critic_loss)
-            self.actor_loss = torch.compile(self.actor_loss)
+            mode = "reduce-overhead" if self.scale.device.type == "cuda" else None  # as ours
+            self.critic_loss = torch.compile(self.critic_loss, mode=mode)
+            self.actor_loss = torch.compile(self.actor_loss, mode=mode)
 
     def flatten(self, ego: Tensor, vehicles: Tensor) -> Tensor:
         """The scene in one vector of scaled features, [B, 9 + 6 rows]."""

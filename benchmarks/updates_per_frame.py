@@ -39,6 +39,8 @@ def train(out: Path, frames: int, overrides: list[str]) -> None:
         return
     settings = ["episodes=null", f"frames={frames}", f"record_every={max(frames // 40, 1)}"]
     settings += ["logger=none", "save_minutes=null", f"save_every={frames}", f"out={out}"]
+    if (out / "checkpoints").exists():
+        overrides, settings = [], [f"resume={out}"]
     subprocess.run([sys.executable, "-m", "saferl", *overrides, *settings], check=True)
 
 

@@ -167,9 +167,10 @@ def trained_policy(cfg: DictConfig, path: Path) -> tuple[TensorDictModuleBase, l
     agent = load_agent(cfg, path, "checkpoint")
     if agent.projector is None:
         return agent.actor, []
-    counted = checkpoint.progress(path)
-    spent = Budget(cfg.episodes, cfg.frames).spent(**counted) if counted else 1.0
-    agent.projector.set_progress(spent)
+    if hasattr(agent.projector, "set_progress"):
+        counted = checkpoint.progress(path)
+        spent = Budget(cfg.episodes, cfg.frames).spent(**counted) if counted else 1.0
+        agent.projector.set_progress(spent)
     return agent.actor, [agent.projector]
 
 

@@ -24,7 +24,7 @@ class Learner:
 
     Args:
         loss: any TorchRL LossModule.
-        optimizer: over the loss's parameters; each group holds ``schedule``, its (first, last)
+        optimizer: over the loss's parameters; a group may hold ``schedule``, its (first, last)
             learning rate, linear in the fraction of the budget that is spent.
         target_updater: soft update of the loss's targets; None where it has none.
         after_update: called with the loss's output after each step (a multiplier, for example).
@@ -34,7 +34,7 @@ class Learner:
         compile: what makes the loss faster, such as :func:`saferl.modules.compiled`; None: nothing.
 
     Raises:
-        ValueError: ``order`` is unknown.
+        ValueError: ``order`` is unknown, or a group has another name.
 
     The groups of the optimizer are called ``"critic"``, ``"actor"`` and ``"alpha"``, as far as there are any.
     """
@@ -50,7 +50,12 @@ class Learner:
     ):
         if order not in ORDERS:
             raise ValueError(f"order must be one of {', '.join(ORDERS)}, got {order!r}.")
-        there = {group["name"] for group in optimizer.param_groups}
+        there = {group.get("name") for group in optimizer.param_groups}
+        if not there or there - set(chain(*ORDERS["joint"])):
+            raise ValueError(
+                f"The groups of an optimizer must be called {', '.join(*ORDERS['joint'])}, got "
+                f"{', '.join(map(str, there))}."
+            )
         self.stages = [names for names in ORDERS[order] if there & set(names)]
         self.loss, self.optimizer, self.target_updater = loss, optimizer, target_updater
         self.after_update = after_update or []
@@ -62,7 +67,7 @@ class Learner:
     def schedule(self, spent: float) -> None:
         """Set the learning rates for a fraction of the budget."""
         for group in self.optimizer.param_groups:
-            first, last = group["schedule"]
+            first, last = group.get("schedule", (group["lr"], group["lr"]))
             group["lr"] = first + (last - first) * spent
 
     def update(self, batch: TensorDictBase) -> TensorDict:

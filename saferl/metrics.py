@@ -16,8 +16,8 @@ FIGURES = {
     "collision_rate": ("CR", True),
     "success_rate": ("SR", True),
     "frozen_rate": ("FR", True),
-    "return": ("AER", False),
-    "speed": ("AEV m/s", False),
+    "return": ("return", False),
+    "speed": ("speed m/s", False),
     "cost_return": ("cost return", False),
     "intervention_rate": ("intervention", False),
 }

@@ -31,7 +31,7 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_guide_has_its_parts():
-    assert len(COMMANDS) == 4 and BUILT_IN in GUIDE
+    assert len(COMMANDS) == 5 and BUILT_IN in GUIDE
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -49,7 +49,7 @@ def test_command_of_the_guide(command: str, project: Path):
         text=True,
     )
     assert done.returncode == 0 and "Files: " in done.stdout, done.stderr
-    assert "return" in done.stdout or "AER" in done.stdout
+    assert "return" in done.stdout
 
 
 def test_algorithm_of_the_examples(project: Path):

@@ -28,9 +28,9 @@ class Chain(nn.Module):
         )
 
 
-def learner(order):
+def learner(order, **names):
     loss = Chain()
-    groups = [{"params": [p], "name": name} for name, p in loss.named_parameters()]
+    groups = [{"params": [p], "name": names.get(name, name)} for name, p in loss.named_parameters()]
     optimizer = torch.optim.SGD(groups, lr=1.0)  # a step goes to the minimum of each term
     calls = []
     targets = SimpleNamespace(step=lambda: calls.append("targets"))
@@ -54,3 +54,16 @@ def test_the_order_decides_what_a_term_sees(order, after, seen):
 def test_an_unknown_order_is_refused():
     with pytest.raises(ValueError, match="order must be one of joint, sequential, got 'paper'"):
         learner("paper")
+
+
+@pytest.mark.parametrize("name", ["policy", None])
+def test_a_group_that_no_step_would_move_is_refused(name):
+    with pytest.raises(ValueError, match=f"must be called critic, actor, alpha, got .*{name}"):
+        learner("joint", actor=name)
+
+
+def test_a_group_without_a_schedule_keeps_its_rate():
+    _, one, _ = learner("joint")
+    one.optimizer.param_groups[0]["schedule"] = (1.0, 0.5)
+    one.schedule(0.5)
+    assert [group["lr"] for group in one.optimizer.param_groups] == [0.75, 1.0, 1.0]

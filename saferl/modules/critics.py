@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
-from torch.utils._pytree import tree_map
+from torch.utils._pytree import tree_map_only
 from torchrl.modules import ValueOperator
 
 #: What may be made of the values of an ensemble's members, [n, *B, 1] -> [*B, 1].
@@ -26,8 +26,18 @@ Reduction = str | Callable[[Tensor], Tensor]
 
 
 def reduction(reduce: Reduction) -> Callable[[Tensor], Tensor]:
-    """The function that a reduction is, or names."""
-    return REDUCTIONS[reduce] if isinstance(reduce, str) else reduce
+    """The function that a reduction is, or names.
+
+    Raises:
+        ValueError: it is neither.
+    """
+    if callable(reduce):
+        return reduce
+    if reduce not in REDUCTIONS:
+        raise ValueError(
+            f"reduce must be one of {', '.join(REDUCTIONS)}, or a function, got {reduce!r}."
+        )
+    return REDUCTIONS[reduce]
 
 
 class StateValue(nn.Module):
@@ -120,8 +130,9 @@ class BoundCritics:
 
     Attributes:
         value: a member's value [*B, 1] from its scene and actions [*B, A].
-        scenes: what each member knows of the states, with the weights that meet the action: a tuple
-            of the members' scenes, or one scene of stacked tensors [n, ...], evaluated at once.
+        scenes: what the members know of the states, with the weights that meet the action: a list
+            of one scene for each, or, ``stacked``, one scene of tensors [n, ...], evaluated at once.
+        stacked: which of the two.
         reduce: what a call makes of the members' values [n, *B, K]: ``"max"``, ``"min"``, ``"mean"``, or a
             function to [*B, 1].
 
@@ -139,6 +150,7 @@ class BoundCritics:
 
     value: Callable[[Any, Tensor], Tensor]
     scenes: Any
+    stacked: bool = False
     reduce: Reduction = "max"
 
     @classmethod
@@ -184,23 +196,32 @@ class BoundCritics:
             states = states.expand(params.batch_size[0], *states.batch_size)
             scenes = torch.vmap(encode)(params, states) if split else [params, states]
         else:
-            scenes = tuple(encode(member, states) for member in params.unbind(0))
-        return cls(network.value if split else whole, scenes, reduce)  # pyright: ignore
+            scenes = [encode(member, states) for member in params.unbind(0)]
+        return cls(network.value if split else whole, scenes, vmap, reduce)  # pyright: ignore
 
     def values(self, action: Tensor) -> Tensor:
         """The value of each member, [n, *B, 1], for actions [*B, A]."""
-        if isinstance(self.scenes, tuple):
+        if not self.stacked:
             return torch.stack([self.value(scene, action) for scene in self.scenes])
         value = torch.vmap(self.value, (0, None), randomness="different")
         return value(self.scenes, action)
 
     def __call__(self, action: Tensor) -> Tensor:
         """The members' values reduced to one, [*B, 1]."""
-        return reduction(self.reduce)(self.values(action))
+        values = self.values(action)
+        reduced = reduction(self.reduce)(values)
+        if reduced.shape != (*values.shape[1:-1], 1):
+            raise ValueError(
+                f"reduce must make one number of the members' values, [n, *B, K] -> [*B, 1], got "
+                f"{tuple(reduced.shape)} of {tuple(values.shape)}."
+            )
+        return reduced
 
     def detach(self) -> BoundCritics:
         """The same, differentiable with respect to the action alone."""
-        return replace(self, scenes=tree_map(lambda x: x.detach(), self.scenes))
+        return replace(
+            self, scenes=tree_map_only((Tensor, TensorDictBase), lambda x: x.detach(), self.scenes)
+        )
 
 
 class CriticEnsemble(TensorDictModuleBase):
@@ -256,8 +277,7 @@ class CriticEnsemble(TensorDictModuleBase):
         action_key: NestedKey = "action",
     ):
         super().__init__()
-        if isinstance(reduce, str) and reduce not in REDUCTIONS:
-            raise ValueError(f"reduce must be one of {sorted(REDUCTIONS)}, got {reduce!r}.")
+        reduction(reduce)
         if isinstance(members, TensorDictModuleBase):
             if params is None:
                 raise ValueError("A template critic needs its stacked params; else pass a list.")
@@ -308,4 +328,6 @@ class CriticEnsemble(TensorDictModuleBase):
         return self.bind(tensordict).values(tensordict.get(self.action_key))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.set(self.out_keys[0], reduction(self.reduce)(self.values(tensordict)))
+        return tensordict.set(
+            self.out_keys[0], self.bind(tensordict)(tensordict.get(self.action_key))
+        )

@@ -9,7 +9,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from saferl.modules.mmam import EGO_SCALE, VEHICLE_SCALE, feature_scale, scale_vehicles
+from saferl.modules.mmam import (
+    EGO_SCALE,
+    VEHICLE_SCALE,
+    check_sizes,
+    feature_scale,
+    scale_ego,
+    scale_vehicles,
+)
 
 
 class _FlatScene(nn.Module):
@@ -32,7 +39,7 @@ class _FlatScene(nn.Module):
                 f"bound to the number of rows it was built for. Set rows to the environment's."
             )
         features, _ = scale_vehicles(vehicles, self.vehicle_scale)
-        return torch.cat([ego / self.ego_scale, features.flatten(-2)], dim=-1)
+        return torch.cat([scale_ego(ego, self.ego_scale), features.flatten(-2)], dim=-1)
 
 
 class _Vector(nn.Module):
@@ -105,8 +112,7 @@ class MLPPolicyEncoder(nn.Module):
         size: int | None = None,
     ):
         super().__init__()
-        if depth < 1:
-            raise ValueError(f"depth must be >= 1, got {depth}.")
+        check_sizes(width=width, depth=depth)
         self.scene = _front(size, rows, ego_scale, vehicle_scale)
         self.in_keys = ("ego", "vehicles") if size is None else ("observation",)
         self.layers = _hidden(self.scene.size, width, depth, activation)
@@ -158,8 +164,7 @@ class MLPValue(nn.Module):
         layer_norm: bool = False,
     ):
         super().__init__()
-        if depth < 1:
-            raise ValueError(f"depth must be >= 1, got {depth}.")
+        check_sizes(width=width, depth=depth, action_dim=action_dim, outputs=outputs)
         self.scene = _front(size, rows, ego_scale, vehicle_scale)
         self.in_keys = ("ego", "vehicles") if size is None else ("observation",)
         self.first = nn.Linear(self.scene.size + action_dim, width)

@@ -26,8 +26,26 @@ def feature_scale(name: str, values: Sequence[float]) -> Tensor:
     return scale
 
 
+def check_sizes(**sizes: int) -> None:
+    """Refuses a size or count below 1, by its name."""
+    for name, value in sizes.items():
+        if value < 1:
+            raise ValueError(f"{name} must be >= 1, got {value}.")
+
+
+def scale_ego(ego: Tensor, scale: Tensor) -> Tensor:
+    """Scaled features [*B, F]."""
+    if ego.shape[-1] != len(scale):  # one feature would be repeated
+        raise ValueError(f"ego must have {len(scale)} features, got shape {tuple(ego.shape)}.")
+    return ego / scale
+
+
 def scale_vehicles(vehicles: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
     """Scaled features [*B, M, F], zero where the row is absent, and presence [*B, M] (bool)."""
+    if vehicles.shape[-1] != len(scale):
+        raise ValueError(
+            f"vehicles must have {len(scale)} features, got shape {tuple(vehicles.shape)}."
+        )
     present = vehicles[..., 0] > 0
     return torch.where(present.unsqueeze(-1), vehicles / scale, 0.0), present
 
@@ -62,7 +80,7 @@ class _SceneTokens(nn.Module):
 
     def forward(self, ego: Tensor, vehicles: Tensor) -> tuple[Tensor, Tensor]:
         features, present = scale_vehicles(vehicles, self.vehicle_scale)
-        ego_token = F.gelu(self.ego(ego / self.ego_scale)).unsqueeze(-2)
+        ego_token = F.gelu(self.ego(scale_ego(ego, self.ego_scale))).unsqueeze(-2)
         tokens = torch.cat([ego_token, F.gelu(self.vehicle(features))], dim=-2)
         # The EV is always there, so no softmax ever runs over absent rows alone.
         return tokens, F.pad(present, (1, 0), value=True)
@@ -73,6 +91,7 @@ class _Attention(nn.Module):
 
     def __init__(self, width: int, heads: int, scale: str):
         super().__init__()
+        check_sizes(width=width, heads=heads)
         if width % heads:
             raise ValueError(f"width must be a multiple of heads, got {width} and {heads}.")
         if scale not in ("paper", "per_head"):
@@ -184,6 +203,9 @@ class MMAMPolicyEncoder(nn.Module):
         vehicle_scale: Sequence[float] = VEHICLE_SCALE,
     ):
         super().__init__()
+        check_sizes(width=width)
+        if depth < 0:
+            raise ValueError(f"depth must be >= 0, got {depth}.")
         if keys not in ("attended", "embedded"):
             raise ValueError(f"keys must be 'attended' or 'embedded', got {keys!r}.")
         self.keys = keys
@@ -267,12 +289,15 @@ class MMAMValue(nn.Module):
         layer_norm: bool = False,
     ):
         super().__init__()
-        if depth < 1:
-            raise ValueError(f"depth must be >= 1, got {depth}.")
+        pooled = width // 4 if pair_width is None else pair_width
+        check_sizes(width=width, depth=depth, outputs=outputs, pair_width=pooled)
         if branch not in ("vehicle", "scene"):
             raise ValueError(f"branch must be 'vehicle' or 'scene', got {branch!r}.")
-        pooled = width // 4 if pair_width is None else pair_width
         if branch == "scene":
+            if pair_width is not None:
+                raise ValueError(
+                    f'pair_width is of branch="vehicle", got {pair_width} with "scene".'
+                )
             pooled = width
         self.tokens = _SceneTokens(width, ego_scale, vehicle_scale)
         self.action = _Linear(action_dim, width)

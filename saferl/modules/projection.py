@@ -111,7 +111,7 @@ def _descend(
 
 @functools.cache
 def _compiled() -> tuple[Callable, Callable]:
-    """The two functions compiled once for the process, for every shape and risk that they meet."""
+    """The two functions compiled, once for the process; see :func:`project` on what compiles them anew."""
     log.info("Compiling the projection at its first use: this takes about a minute.")
     return compiled(_evaluate), compiled(_descend)
 
@@ -165,8 +165,9 @@ def project(
             ``"safest"``, the one of least risk, a_init included.
         low: lower end of the box, for every coordinate.
         high: upper end of the box.
-        compile: whether to compile the steps, several of them into one function; each shape of
-            ``action`` is compiled once. The result is the same up to rounding.
+        compile: whether to compile the steps, several of them into one function, anew for each shape of
+            ``action`` and each setting; beyond a few of them (torch's ``recompile_limit``) the rest run
+            as they are. The result is the same up to rounding.
 
     Returns:
         A :class:`ProjectionResult`, detached.
@@ -191,7 +192,11 @@ def project(
         (evaluate, descend), together = _compiled(), _TOGETHER
     risk_before, slope = evaluate(risk_fn, start)
     none = torch.zeros_like(risk_before, dtype=torch.int64)
-    at = _Descent(start, slope, risk_before, risk_before > limit, none, start, risk_before)
+    risky = risk_before > limit
+    # Copies, as compiled code is made anew for inputs that are one tensor.
+    at = _Descent(
+        start.clone(), slope, risk_before, risky, none, start.clone(), risk_before.clone()
+    )
     for done in range(0, steps, together):
         # To ask a GPU would be to wait for it.
         if start.device.type == "cpu" and not at.active.any():

@@ -115,6 +115,12 @@ class CostCriticLoss(LossModule):
             create_target_params=create_target_params,
             compare_against=compare_against,
         )
+        if not isinstance(lagrange, LagrangeMultiplier):
+            raise ValueError(f"lagrange must be a LagrangeMultiplier, got {lagrange!r}.")
+        if not callable(self.risk):
+            raise ValueError(
+                f"risk must be a function, such as saferl.modules.Largest(), got {risk!r}."
+            )
         self.lagrange = lagrange
         device = next(self.parameters()).device
         self.register_buffer("cost_limit", torch.tensor(cost_limit, device=device))
@@ -245,6 +251,8 @@ class CostCriticLoss(LossModule):
             for key in (keys.cost, keys.done, keys.terminated):  # estimators want one shape of all
                 following.set(key, following.get(key).expand_as(next_value))
             return estimator.value_estimate(data.set("next", following), next_value=next_value)
+        if "steps_to_next_obs" in tensordict.keys():  # noqa: SIM118
+            raise ValueError('cost_backup="reach" is of single steps, got "steps_to_next_obs".')
         cost = tensordict.get(("next", self.tensor_keys.cost))
         terminated = tensordict.get(("next", self.tensor_keys.terminated))
         gamma, ahead = estimator.gamma.to(cost), torch.where(terminated, 0.0, next_value)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -274,7 +274,7 @@ class SACLagLoss(CostCriticLoss, SACLoss):
         sample, log_prob = self._sample_action(tensordict)
         action = sample.get(self.tensor_keys.action)
         qvalue = reward.detach().values(action).min(0)[0]
-        cost_value = self.risk(cost.detach().values(action))
+        cost_value = replace(cost.detach(), reduce=self.risk)(action)
         penalty = self.lagrange.penalty(cost_value.squeeze(-1) - self.cost_limit)
         multiplier = self.lagrange.value.detach().to(penalty)
         loss_actor = self._alpha * log_prob - qvalue.squeeze(-1) + multiplier * penalty

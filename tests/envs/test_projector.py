@@ -213,8 +213,10 @@ def test_start_of_the_correction():
         assert data["next", "intervened"].any() == acts
         assert (data["next", "risk_before"] > LIMIT).any()  # reported all the time
         check(data, feasible=acts)
-    assert env.transform.state_dict()["enabled"]
-    assert projector().enabled
+    resumed = projector(start=0.5)
+    assert projector().enabled and not resumed.enabled
+    resumed.load_state_dict(env.transform.state_dict())
+    assert resumed.enabled
 
 
 @pytest.mark.parametrize("keep", ["last", "safest"])
@@ -231,3 +233,7 @@ def test_settings_are_checked_at_once():
         projector(start=1.5)
     with pytest.raises(ValueError, match="keep must be"):
         projector(keep="first")
+    blind = TensorDictModule(lambda felt: felt[..., :1], ["felt"], ["risk"])
+    for risk in (None, blind):
+        with pytest.raises(ValueError, match="risk must be a TensorDictModule that reads 'action'"):
+            SafetyProjector(risk, 0.5)

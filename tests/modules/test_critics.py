@@ -75,7 +75,25 @@ def test_equals_members_one_by_one(reduce, members, batch):
     torch.testing.assert_close(slope, full)
 
 
-@pytest.mark.parametrize("members", [critics("mmam", 3), critics("mlp"), plain_critics()])
+class Pair(MLPValue):
+    """Its scene is a tuple, with as many parts as there are members."""
+
+    def encode(self, *observed):
+        scene = super().encode(*observed)
+        return scene.pop("first"), scene
+
+    def value(self, scene, action):
+        first, scene = scene
+        return super().value({"first": first, **scene}, action)
+
+
+MEMBERS = [
+    *(critics("mmam", 3), critics("mlp"), plain_critics()),
+    [value_operator(Pair(rows=3, width=16), out_key=KEY) for _ in range(2)],
+]
+
+
+@pytest.mark.parametrize("members", MEMBERS)
 def test_at_once_and_one_by_one(members):
     """The members stacked, as on a GPU, give the values and gradients that they give in turn."""
     ensemble, td = CriticEnsemble(members), scene()
@@ -178,6 +196,10 @@ def test_errors():
     one, two = critics()
     with pytest.raises(ValueError, match=r"reduce must be one of .* got 'median'"):
         CriticEnsemble([one, two], reduce="median")
+    with pytest.raises(ValueError, match=r"or a function, got None"):
+        CriticEnsemble([one, two], reduce=None)  # type: ignore
+    with pytest.raises(ValueError, match=r"to?.*one number .* got \(5,\) of \(2, 5, 1\)"):
+        CriticEnsemble([one, two], reduce=lambda v: v.amax(0).squeeze(-1))(scene())
     with pytest.raises(ValueError, match="at least one critic"):
         CriticEnsemble([])
     with pytest.raises(ValueError, match="needs its stacked params"):

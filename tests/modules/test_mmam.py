@@ -177,7 +177,6 @@ def test_every_input_matters():
     grads = torch.autograd.grad(net(ego, vehicles, action).sum(), [ego, vehicles, action])
     assert (grads[0] != 0).all() and (grads[2] != 0).all()
     assert (grads[1][..., 1:] != 0).all()
-    assert all(p.grad is None for p in net.parameters())
     grads = torch.autograd.grad(net(ego, vehicles, action).sum(), list(net.parameters()))
     assert all((g != 0).any() for g in grads)
 
@@ -221,6 +220,9 @@ def test_functional_transforms(kind):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"heads": 0}, "heads must be >= 1, got 0"),
+        ({"width": 0}, "width must be >= 1, got 0"),
+        ({"depth": -1}, r"depth must be >= \d, got -1"),
         ({"heads": 3}, "multiple of heads, got 16 and 3"),
         ({"scale": "sqrt"}, "'paper' or 'per_head', got 'sqrt'"),
         ({"ego_scale": [1.0, 0.0]}, r"ego_scale must be positive .* got \(1.0, 0.0\)"),
@@ -238,3 +240,17 @@ def test_unknown_forms_are_refused():
         MMAMPolicyEncoder(16, keys="both")
     with pytest.raises(ValueError, match="branch must be 'vehicle' or 'scene', got 'token'"):
         MMAMValue(16, branch="token")
+    with pytest.raises(ValueError, match='pair_width is of branch="vehicle", got 8 with "scene"'):
+        MMAMValue(16, branch="scene", pair_width=8)
+    with pytest.raises(ValueError, match="outputs must be >= 1, got 0"):
+        MMAMValue(16, outputs=0)
+
+
+def test_other_features_are_refused():
+    """A single one would be repeated."""
+    ego, vehicles, _ = scene()
+    encoder = make(MMAMPolicyEncoder)
+    with pytest.raises(ValueError, match=r"ego must have 9 features, got shape \(\d+, 1\)"):
+        encoder(ego[..., :1], vehicles)
+    with pytest.raises(ValueError, match="vehicles must have 6 features, got shape"):
+        encoder(ego, vehicles[..., :1])

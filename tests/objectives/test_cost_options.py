@@ -37,9 +37,8 @@ def build(outputs: int = 1, members: int = 2, **settings) -> SACLagLoss:
         tanh_gaussian_actor(encoder, 8, 2, in_keys=["observation"]).double(),
         critics(2, "state_action_value"),
         critics(members, "state_action_cost_value", outputs),
-        lagrange=DualAscent(init=3.0),
         num_cost_critics=members,
-        **settings,
+        **{"lagrange": DualAscent(init=3.0)} | settings,
     )
     loss.make_value_estimator(gamma=GAMMA)
     return loss
@@ -199,3 +198,9 @@ def test_one_critic_is_trained():
 def test_refuses():
     with pytest.raises(ValueError, match="cost_backup must be one of sum, reach, got 'min'"):
         build(cost_backup="min")
+    with pytest.raises(ValueError, match="lagrange must be a LagrangeMultiplier, got 1.0"):
+        build(lagrange=1.0)
+    with pytest.raises(ValueError, match="risk must be a function, .* got 'max'"):
+        build(risk="max")
+    with pytest.raises(ValueError, match="is of single steps"):
+        build(cost_backup="reach")(batch_of().set("steps_to_next_obs", torch.ones(6, 1)))

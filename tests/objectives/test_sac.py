@@ -11,7 +11,7 @@ from torch import nn
 from torchrl.objectives import SoftUpdate, ValueEstimators
 from torchrl.objectives.value import TD0Estimator
 
-from saferl.modules import DualAscent, PIDMultiplier
+from saferl.modules import BoundCritics, DualAscent, PIDMultiplier
 from saferl.objectives import SACLagLoss
 
 # Gradients and state
@@ -243,12 +243,13 @@ def test_default_keys(make_loss):
 
 
 @pytest.mark.parametrize("reduction", ["mean", "none"])
-def test_a_loop_over_members_equals_vmap(make_loss, make_batch, reduction):
-    losses = [
-        make_loss(reduction=reduction, deactivate_vmap=flag, num_cost_critics=3)
-        for flag in (False, True)
-    ]
-    vmapped, looped = (run(loss, make_batch()) for loss in losses)
+def test_a_loop_over_members_equals_vmap(make_loss, make_batch, monkeypatch, reduction):
+    """Where the members are stacked, as on a GPU, and where they are not."""
+    losses = [make_loss(reduction=reduction, num_cost_critics=3) for _ in range(2)]
+    looped = run(losses[1], make_batch())
+    bind = BoundCritics.of
+    monkeypatch.setattr(BoundCritics, "of", lambda *args, **kw: bind(*args, **kw | {"vmap": True}))
+    vmapped = run(losses[0], make_batch())
     assert_same(vmapped, looped)
     for output in (vmapped, looped):
         sum(output[key].sum() for key in LOSSES).backward()

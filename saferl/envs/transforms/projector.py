@@ -78,6 +78,7 @@ class SafetyProjector(Transform):
     Attributes:
         latencies: seconds that each of the last 10,000 corrections took, of all risky states of a step
             together (on a GPU: to queue them).
+        enabled: whether it corrects yet.
 
     Reads the action and the observation at the time of a step. Writes under ``next``:
     ``action_executed`` [*B, A]; ``risk_before`` and ``risk_after`` [*B, 1], the risks of the
@@ -87,7 +88,8 @@ class SafetyProjector(Transform):
     unchanged and the risks are still reported.
 
     Raises:
-        ValueError: if ``start`` is not in [0, 1], or for a setting that ``project`` refuses.
+        ValueError: if ``start`` is not in [0, 1], ``risk`` does not read the action, or for a setting that
+            ``project`` refuses.
         RuntimeError: in a step under ``torch.inference_mode``; ``torch.no_grad`` is fine.
 
     Examples:
@@ -104,8 +106,6 @@ class SafetyProjector(Transform):
         >>> bool((data["next", "action_executed"][..., 0] <= 0.5).all())
         True
     """
-
-    enabled: Tensor
 
     def __init__(
         self,
@@ -125,6 +125,11 @@ class SafetyProjector(Transform):
         super().__init__()
         if not 0.0 <= start <= 1.0:
             raise ValueError(f"start must be a fraction in [0, 1], got {start}.")
+        action_key = unravel_key(action_key)
+        if action_key not in getattr(risk, "in_keys", ()):
+            raise ValueError(
+                f"risk must be a TensorDictModule that reads {action_key!r}, got {risk}."
+            )
         self.risk = risk
         self.limit = float(limit)
         self.settings = {
@@ -140,12 +145,18 @@ class SafetyProjector(Transform):
         self.settings["compile"] = compile
         self.latencies = deque[float](maxlen=10_000)
         self.start = float(start)
-        self.action_key = unravel_key(action_key)
-        self.register_buffer("enabled", torch.tensor(start == 0.0))
+        self.action_key = action_key
+        self.enabled = start == 0.0  # no tensor: to ask a GPU would be to wait for it
+
+    def get_extra_state(self) -> bool:
+        return self.enabled
+
+    def set_extra_state(self, state: bool) -> None:
+        self.enabled = state
 
     def set_progress(self, fraction: float) -> None:
         """Switches the correction on once ``fraction`` of the run is at least ``start``."""
-        self.enabled.fill_(fraction >= self.start)
+        self.enabled = fraction >= self.start
 
     def _look(self, inputs: TensorDictBase) -> tuple[Callable[[Tensor], Tensor], Tensor]:
         """What :func:`_risk_of_action` makes of the states and actions in ``inputs`` [N]."""
