@@ -6,13 +6,14 @@
 An update is whole on every side: losses, gradients, optimizer and target networks, on one and the same
 batch. The sides take turns in one process:
 
-- ARSAC with MMAM as printed (``PlainMMAMPolicyEncoder``, ``PlainMMAMValue``), with ours, and with ours
+- ARSAC with MMAM as printed (``PlainMMAMPolicyEncoder``, ``PlainMMAMValue``) and with ours, each eager and
   compiled;
 - SAC-Lag on MLPs, ours and a straight PyTorch implementation (``benchmarks/straight.py``), as CleanRL
   writes SAC and tuned, each eager and compiled;
 - SAC on the same MLPs by TorchRL's own loss, for scale: it has no cost critics;
-- OmniSafe's SACLag, where ``--omnisafe`` names the Python of an environment that has it
-  (``benchmarks/omnisafe_sac_lag.py`` says how to make one). It has one cost critic where ours has two.
+- afterwards, in a process of its own, OmniSafe's SACLag, where ``--omnisafe`` names the Python of an environment
+  that has it (``benchmarks/omnisafe_sac_lag.py`` says how to make one); with the default width, batch and thread
+  alone. It has one cost critic where ours has two.
 
 GFLOP are those of one eager update as torch counts them; the share is of the rate of a product of two
 1,024 x 1,024 matrices, measured in the same rounds. The matrix products of SAC-Lag's update are also timed

@@ -260,7 +260,7 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
     )
     if cfg.lagrange.signal is not None:
         hydra.utils.instantiate(cfg.lagrange.signal).register(trainer)
-    if hasattr(agent.projector, "set_progress"):
+    if agent.projector is not None and hasattr(agent.projector, "set_progress"):
         ProjectorProgress(agent.projector).register(trainer)
     trainer.open_loggers = lambda: build_loggers(cfg, run)
     return trainer
