@@ -47,6 +47,7 @@ TRAINING = {
     "evaluation.episodes": (int, 1, math.inf),
     "evaluation.num_envs": (int, 1, math.inf),
     "evaluation.policy_frequency": (int, 1, math.inf),
+    "env.num_envs": (int, 1, math.inf),
     "collector.frames_per_env": (int, 1, math.inf),
     "encoder.policy.width": (int, 1, math.inf),
     "critic.members": (int, 1, math.inf),
