@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import time
 from pathlib import Path
@@ -16,6 +17,7 @@ from small import EMPTY, SMALL, compose
 from saferl.agents import build_agent, load_agent
 from saferl.builders import build_trainer
 from saferl.checkpoint import CONFIG, run_config
+from saferl.summary import main as summarise
 from saferl.trainer import _interrupts
 
 TRAIN, TEST, EXPORT = ("train", "config"), ("evaluate", "evaluate"), ("export", "export")
@@ -252,6 +254,14 @@ def test_train_from_any_folder_then_multirun(command, tmp_path: Path, capsys):
         True
     ] * 4
     assert all((job / "evaluation/metrics.json").is_file() for job in jobs)
+    summary = capsys.readouterr().out.splitlines()[-3:]
+    summarise(["many"])
+    assert capsys.readouterr().out.splitlines() == summary
+    with pytest.raises(SystemExit, match="no run below elsewhere has been tested"):
+        summarise(["elsewhere"])
+    assert summary[0].split() == ["seeds", "SR", "%", "CR", "%", "return", "cost", "return"]
+    for line, algo in zip(summary[1:], ("sac", "asac"), strict=True):
+        assert re.match(algo + r" gs +2 +\S+ \[\S+, \S+\]  ", line)
 
 
 def test_run_folder_has_a_name_that_shells_like(command, tmp_path: Path):
@@ -291,11 +301,14 @@ def test_the_readmes_everyday_commands_work_in_order(command, tmp_path: Path):
     readme = (Path(__file__).parents[1] / "README.md").read_text()
     block = readme.partition("## Everyday commands")[2].split("```")[1]
     lines = [line.partition("#")[0].split() for line in block.splitlines() if "-m saferl" in line]
-    assert len(lines) == 10
+    assert len(lines) == 11
     small = {"saferl": (*SMALL, *EMPTY), "saferl.evaluate": (*EMPTY, "episodes=1", "gif=0")}
     for _, _, module, *arguments in lines:
         name = module.partition(".")[2] or "train"
         if "--help" in arguments:
+            continue
+        if name == "summary":
+            summarise(arguments)
             continue
         if not any(argument.startswith("resume=") for argument in arguments):
             arguments += small.get(module, ())
