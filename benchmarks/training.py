@@ -1,7 +1,7 @@
 """Where the time of a whole training goes, and how much memory it takes.
 
     python benchmarks/training.py [--algos arsac sac_lag] [--task mixed] [--episodes 10000]
-        [--set KEY=VALUE ...] [--json PATH]
+        [--set KEY=VALUE ...] [--out DIR] [--json PATH]
 
 Trains each algorithm from nothing on the default settings, changed by ``--set``, in a process of its
 own, and prints wall-clock time, peak memory, updates and the success rate of the last 200 training
@@ -12,6 +12,8 @@ episodes, with the shares of five phases:
 - project: the correction of risky actions;
 - learn: sampling, losses, gradients, optimizer, target networks;
 - other: the rest, with the first steps' compiling, storing, transforms, records and checkpoints.
+
+With ``--out`` the runs stay in ``DIR/ALGO``, where ``saferl.evaluate`` can test them.
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ from hydra import compose, initialize_config_dir
 from side_by_side import write
 
 from saferl.builders import build_trainer
+from saferl.commands import claim
 from saferl.paths import config_dir
 
 PHASES = ("simulate", "act", "project", "learn", "other")
@@ -65,13 +68,15 @@ class Stopwatch:
         setattr(owner, method, timed)
 
 
-def train(overrides: list[str]) -> dict:
+def train(overrides: list[str], out: Path | None) -> dict:
     """One training in this process; its figures."""
     with initialize_config_dir(config_dir(), version_base="1.3"):
         cfg = compose("config", overrides)
     watch, begin = Stopwatch(), time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        trainer = build_trainer(cfg, Path(folder))
+        run = Path(folder) if out is None else out
+        trainer = build_trainer(cfg, run)
+        claim(run, cfg)
         env = trainer.collector.env
         for method in ("_step", "_reset"):
             watch.wrap(env.base_env, method, "simulate")
@@ -107,6 +112,7 @@ def main() -> None:
     parser.add_argument("--task", default="mixed")
     parser.add_argument("--episodes", type=int, default=10_000)
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--out", type=Path, help="keep the runs below this folder")
     parser.add_argument("--json", type=Path, help="write the figures here")
     options = parser.parse_args()
 
@@ -120,7 +126,7 @@ def main() -> None:
         overrides = [f"algo={algo}", f"task={options.task}", f"episodes={options.episodes}"]
         overrides += ["logger=none", *options.set]
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
-            one = process.submit(train, overrides).result()
+            one = process.submit(train, overrides, options.out and options.out / algo).result()
         result[algo] = one
         print(
             f"{algo:10s}{one['wall_s'] / 60:9.1f}{one['peak_MB']:9.0f}{one['frames']:9d}"
