@@ -4,7 +4,7 @@
         [--set KEY=VALUE ...] [--seeds 0 1] [--tasks lt gs rt] [--episodes 500] [--jobs 2] [--json PATH]
 
 Trains every composition with every seed on ``task=mixed``, ``--jobs`` at once with one thread each, and tests it
-on each task, the same episodes for all. A run that is there already is continued, or left as it is, so that the
+on each task, the same episodes for all. ``{seed}`` in a setting is the seed: ``init=runs/asac_{seed}``. A run that is there already is continued, or left as it is, so that the
 script can be stopped and started again. Prints one line for each composition and task: the rates of every
 seed, and of all seeds' episodes together with Wilson's 95% interval. The seeds differ by more than such
 an interval says.
@@ -37,13 +37,18 @@ def saferl(module: str, *arguments: str, log: Path) -> None:
         raise SystemExit(f"{' '.join(command)} failed: see {log}")
 
 
+def settings(name: str, seed: int, options: argparse.Namespace) -> list[str]:
+    each = [setting.replace("{seed}", str(seed)) for setting in (*name.split(), *options.set)]
+    return [*each, f"seed={seed}"]
+
+
 def train_and_test(run: Path, overrides: list[str], options: argparse.Namespace) -> None:
     """What is not there yet of a run and its tests."""
     run.parent.mkdir(parents=True, exist_ok=True)
     log = run.with_suffix(".log")
     if not (run / "checkpoints").exists():
         fixed = ["task=mixed", "threads=1", "logger=none", "evaluation.episodes=1", f"out={run}"]
-        saferl("saferl", *overrides, *options.set, *fixed, log=log)
+        saferl("saferl", *overrides, *fixed, log=log)
     elif not (run / "evaluation" / "metrics.json").exists():
         saferl("saferl", f"resume={run}", log=log)
     for task in options.tasks:
@@ -75,7 +80,7 @@ def main() -> None:
     }
     with ThreadPoolExecutor(options.jobs) as pool:
         waiting = [
-            pool.submit(train_and_test, run, [*name.split(), f"seed={seed}"], options)
+            pool.submit(train_and_test, run, settings(name, seed, options), options)
             for (name, seed), run in folders.items()
         ]
         for each in waiting:

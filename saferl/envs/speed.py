@@ -1,6 +1,6 @@
 """Running tasks with a speed limit: ``pip install 'saferl[mujoco]'``.
 
-    python -m saferl experiment=speed algo=sac_lag lagrange=signed lagrange.multiplier.lr=1e-3
+    python -m saferl experiment=speed algo=sac_lag lagrange=signed lagrange.multiplier.lr=3e-3
 
 Importing this registers ``saferl/{HalfCheetah,Hopper,Walker2d,Swimmer,Ant}Speed-v0``.
 """

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-import gymnasium
-import pytest
+from pathlib import Path
 
+import gymnasium
+import hydra
+import pytest
+from small import compose
+
+from saferl.builders import build_env, build_trainer
 from saferl.envs import GymEnvs, GymTask
 from saferl.envs.speed import RUNNERS, SpeedLimit
+from saferl.evaluation import evaluate
+from saferl.metrics import summarise
 
 
 class Runner(gymnasium.Env):
@@ -48,3 +55,25 @@ def test_mujocos_runners(runner: str):
     assert env.horizon == 1000
     data = env.rollout(3)
     assert data["next", "cost"].eq(1).all() and data["next", "reward"].isfinite().all()
+
+
+@pytest.mark.slow
+def test_the_cost_falls_to_the_limit(tmp_path: Path):
+    """Of the half-cheetah's 1,000 steps without a limit hundreds are too fast, with it at most the 25
+    that a discounted cost of 2.5 allows on average."""
+    pytest.importorskip("mujoco")
+    cost = {}
+    for algo, options in {
+        "sac": ("frames=50000",),
+        "sac_lag": ("lagrange=signed", "lagrange.multiplier.lr=3e-3"),
+    }.items():
+        cfg = compose("experiment=speed", f"algo={algo}", *options, "threads=1", "logger=none")
+        trainer = build_trainer(cfg, tmp_path / algo)
+        trainer.train()
+        task = hydra.utils.instantiate(cfg.task)
+        rows = evaluate(trainer.collector.policy, build_env(cfg, task, 10, 0), 20, 0)
+        figures = summarise(rows)
+        cost[algo] = figures["cost_return"]
+        for name in ("cost_return", "return"):
+            print(algo, name, {bound: round(v, 2) for bound, v in figures[name].items()})
+    assert cost["sac"]["low"] > 100 and cost["sac_lag"]["high"] < 25
