@@ -48,9 +48,10 @@ class CPOLoss(CostValueLoss, PPOLoss):
 
     with g and b the gradients of the mean of ratio times advantage, of reward and cost, H the Fisher matrix of
     the policy, and :math:`c = (J_c - d) / w` the violation *per decision*: g and b are means over decisions,
-    and :math:`J_c(\pi') - J_c(\pi)` is to first order :math:`w = \sum_{t<L} \gamma^t` times such a mean, L an
-    episode's mean length over the last batches. :math:`J_c` is the discounted cost of an episode from its start
-    to its end, by termination or truncation.
+    and :math:`J_c(\pi') - J_c(\pi)` is to first order :math:`w = E[\sum_{t<L} \gamma^t]` times such a mean, L the
+    length of an episode. :math:`J_c = E[\sum_{t<L} \gamma^t c_t]` is the discounted cost of an episode from its
+    start to its end, by termination or truncation; both are means over the episodes that ended in the batch,
+    which may have begun in earlier ones.
 
     The step is shortened by ``backtrack`` until the KL is within delta, the surrogate does not get worse, and
     the cost's surrogate does not rise above its limit (above where it was, from an infeasible start); if none
@@ -116,9 +117,7 @@ class CPOLoss(CostValueLoss, PPOLoss):
 
     cost_limit: Tensor
     report: Tensor
-    starts: Tensor
-    decisions: Tensor
-    cost_return: Tensor
+    episode: Tensor
 
     def __init__(
         self,
@@ -161,9 +160,18 @@ class CPOLoss(CostValueLoss, PPOLoss):
         self.search_steps, self.backtrack = search_steps, backtrack
         # Of the last step: KL, J_c, fraction of the step, number of the case.
         self.register_buffer("report", torch.full((4,), torch.nan, device=device))
-        # Episodes that began and decisions that were made, in the last batches; the last J_c.
-        for name in ("starts", "decisions", "cost_return"):
-            self.register_buffer(name, torch.zeros((), dtype=torch.float64, device=device))
+        # Means over the episodes that ended last: discounted cost, and discounted number of decisions.
+        self.register_buffer(
+            "episode", torch.full((2,), torch.nan, dtype=torch.float64, device=device)
+        )
+        # Both so far in each episode that goes on, the next step's discount, and whether its start was seen.
+        self.running = torch.zeros(0, 4, dtype=torch.float64)
+
+    def get_extra_state(self) -> dict[str, Tensor]:
+        return {"running": self.running}
+
+    def set_extra_state(self, state: dict[str, Tensor]) -> None:
+        self.running = state["running"]
 
     @torch.no_grad()
     def begin(self, tensordict: TensorDictBase) -> None:
@@ -182,32 +190,48 @@ class CPOLoss(CostValueLoss, PPOLoss):
         self._step(tensordict.reshape(-1), (cost - self.cost_limit) / weight)
         self.report[1] = cost
 
+    @torch.no_grad()
     def cost_of_policy(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         r"""The discounted cost of an episode of the policy that collected a batch, and its decisions.
 
-        :math:`J_c = E_{s_0}[\sum_{t<L} \gamma^t c_t]` is the mean of the cost's value targets at the episodes' first
-        steps (``"is_init"``, of TorchRL's ``InitTracker``), the last one where no episode begins in the batch.
-        The second is :math:`w = \sum_{t<L} \gamma^t`, L the decisions for each episode that began, in this batch and,
-        with weights that fall by a tenth from one to the next, in those before. Each call counts its batch.
+        Means of :math:`\sum_{t<L} \gamma^t c_t` and :math:`\sum_{t<L} \gamma^t` over the episodes that end in the
+        batch and whose start was seen, in this batch or in an earlier one: each call takes its batch as the
+        continuation of the one before, where the shapes are equal. Where none ends, the last such means; before
+        the first end, what the running episodes have cost so far and V_c of the rest.
 
         Args:
-            tensordict: ``[*B, T]`` as :meth:`CostValueLoss.begin` leaves it.
+            tensordict: ``[*B, T]`` as :meth:`CostValueLoss.begin` leaves it; ``"is_init"`` (of TorchRL's
+                ``InitTracker``) tells where episodes begin.
 
         Returns:
             Two scalars, J_c in the unit of the cost.
         """
-        target = tensordict.get(self.tensor_keys.cost_value_target).squeeze(-1)
-        first = tensordict.get(self.tensor_keys.is_init).squeeze(-1).to(target)
-        count = first.sum()
-        known = target.mean() if self.starts == 0 else self.cost_return.to(target)
-        cost = torch.where(count > 0, (first * target).sum() / count.clamp_min(1), known)
-        self.cost_return.copy_(cost)
-        self.starts.mul_(0.9).add_(count)
-        self.decisions.mul_(0.9).add_(target.numel())
-        length = (self.decisions / self.starts.clamp_min(1)).to(target)
-        gamma = self._cost_value_estimator.gamma.to(target)
-        weight = torch.where(gamma < 1, (1 - gamma**length) / (1 - gamma).clamp_min(1e-12), length)
-        return cost, weight
+        following, keys = tensordict.get("next"), self.tensor_keys
+        cost, done = (following.get(key).squeeze(-1) for key in (keys.cost, keys.done))
+        first = tensordict.get(keys.is_init).squeeze(-1)
+        gamma = self._cost_value_estimator.gamma.to(self.episode)
+        running = self.running.to(self.episode.device)
+        if running.shape[:-1] != cost.shape[:-1]:
+            running = self.episode.new_tensor([0.0, 0.0, 1.0, 0.0]).expand(*cost.shape[:-1], 4)
+        fresh = running.new_tensor([0.0, 0.0, 1.0, 1.0])
+        steps = []
+        for now, start in zip(cost.unbind(-1), first.unbind(-1), strict=True):
+            total, weight, discount, seen = torch.where(start[..., None], fresh, running).unbind(-1)
+            parts = (total + discount * now, weight + discount, discount * gamma, seen)
+            running = torch.stack(parts, -1)
+            steps.append(running)
+        self.running = running
+        after = torch.stack(steps, -2)
+        ended = after[done & (after[..., 3] > 0)]
+        if len(ended):
+            self.episode.copy_(ended[:, :2].mean(0))
+        elif self.episode.isnan().any():
+            with self.cost_critic_params.to_module(self.cost_critic, preserve_module_state=False):
+                last = following[..., -1].select(*self.cost_critic.in_keys)
+                ahead = self.cost_critic(last).get(keys.state_cost_value).squeeze(-1)
+            rest = torch.where(done[..., -1], 0.0, running[..., 2] * ahead)
+            return (running[..., 0] + rest).mean().to(cost), running[..., 1].mean().to(cost)
+        return self.episode[0].to(cost), self.episode[1].to(cost)
 
     def _surrogates(
         self, batch: TensorDictBase, old: Distribution
@@ -225,22 +249,33 @@ class CPOLoss(CostValueLoss, PPOLoss):
         reward, cost = reward - reward.mean(), cost - cost.mean()
         return (ratio * reward).mean(), (ratio * cost).mean(), policy_kl(old, new).mean()
 
+    @torch.no_grad()
     def _step(self, batch: TensorDictBase, violation: Tensor) -> None:
         parameters = [p for p in self.actor_network_params.values(True, True) if p.requires_grad]
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             old = self.actor_network.get_dist(batch.select(*self.actor_network.in_keys))
+
+        def gradient_of(term: Tensor, create_graph: bool = False) -> Tensor:
+            # A parameter that the policy does not use has none.
+            return flat(
+                torch.autograd.grad(
+                    term,
+                    parameters,
+                    retain_graph=True,
+                    create_graph=create_graph,
+                    allow_unused=True,
+                    materialize_grads=True,
+                )
+            )
+
         with torch.enable_grad():
             reward, cost, kl = self._surrogates(batch, old)
-            gradient, cost_gradient = (
-                flat(torch.autograd.grad(term, parameters, retain_graph=True))
-                for term in (reward, cost)
-            )
-            kl_gradient = flat(torch.autograd.grad(kl, parameters, create_graph=True))
+            gradient, cost_gradient = gradient_of(reward), gradient_of(cost)
+            kl_gradient = gradient_of(kl, create_graph=True)
 
         def fisher(vector: Tensor) -> Tensor:
             with torch.enable_grad():
-                product = torch.autograd.grad(kl_gradient @ vector, parameters, retain_graph=True)
-            return flat(product) + self.damping * vector
+                return gradient_of(kl_gradient @ vector) + self.damping * vector
 
         direction = constrained_direction(
             gradient,

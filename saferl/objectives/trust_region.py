@@ -18,7 +18,7 @@ def flat(tensors: Iterable[Tensor]) -> Tensor:
 
 
 def conjugate_gradient(
-    product: Callable[[Tensor], Tensor], target: Tensor, steps: int = 15, tolerance: float = 1e-10
+    product: Callable[[Tensor], Tensor], target: Tensor, steps: int = 15, tolerance: float = 1e-14
 ) -> Tensor:
     """Solve H x = target for a symmetric positive definite H that is known by its products.
 

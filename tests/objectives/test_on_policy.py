@@ -20,7 +20,7 @@ from saferl.modules import (
 )
 from saferl.objectives import CPOLoss, PPOLagLoss
 from saferl.objectives.cpo import policy_kl
-from saferl.objectives.trust_region import CASES, flat
+from saferl.objectives.trust_region import CASES, constrained_direction, flat
 
 GAMMA, LAMBDA, SIZE = 0.9, 0.8, 3
 LOSSES = {"ppo_lag": PPOLagLoss, "cpo": CPOLoss}
@@ -174,54 +174,125 @@ def test_a_loss_loads_another_ones_state(kind: str):
             torch.testing.assert_close(term, two(again.reshape(-1))[key])
 
 
-def test_cost_of_the_policy_is_that_of_its_starts():
+def drive(data: TensorDict, over: torch.Tensor, previous: torch.Tensor) -> None:
+    """Let the episodes of a batch end where ``over`` [B, T] says, the next ones begin behind; ``previous`` [B] is
+    whether the step before the batch ended one."""
+    data["next", "done"] = over.unsqueeze(-1)
+    data["is_init"] = torch.cat([previous[:, None], over[:, :-1]], 1).unsqueeze(-1)
+
+
+@pytest.mark.parametrize("gamma", [GAMMA, 1.0])
+def test_cost_of_the_policy_is_that_of_whole_episodes(gamma: float):
+    """Against lists of costs, over several batches: each episode from its start to its end, once."""
     loss, actor = build("cpo")
+    loss.make_value_estimator(ValueEstimators.GAE, gamma=gamma, lmbda=0.95)
+    played: list[list[float]] = [[] for _ in range(4)]
+    previous, known = torch.ones(4, dtype=torch.bool), None
+    generator = torch.Generator().manual_seed(0)
+    for number in range(12):
+        data = batch_of(actor, seed=number)
+        over = torch.rand(4, 7, generator=generator) < (0.0 if number in (0, 5) else 0.1)
+        drive(data, over, previous)
+        previous = over[:, -1]
+        super(CPOLoss, loss).begin(data)
+        cost, weight = loss.cost_of_policy(data)
+        finished = []
+        for row in range(4):
+            for t in range(7):
+                played[row].append(float(data["next", "cost"][row, t]))
+                if over[row, t]:
+                    finished.append(played[row])
+                    played[row] = []
+        if finished:
+            sums = [sum(c * gamma**t for t, c in enumerate(costs)) for costs in finished]
+            weights = [sum(gamma**t for t in range(len(costs))) for costs in finished]
+            known = sum(sums) / len(sums), sum(weights) / len(weights)
+        if known is None:  # what was paid so far, and the critic of the rest
+            with torch.no_grad(), loss.cost_critic_params.to_module(loss.cost_critic):
+                rest = loss.cost_critic(data[:, -1]["next"].select("observation"))
+            rest = gamma**7 * rest["state_cost_value"].squeeze(-1)
+            sums = [sum(c * gamma**t for t, c in enumerate(costs)) for costs in played]
+            assert float(cost) == pytest.approx(sum(sums) / 4 + float(rest.mean()))
+        else:
+            assert (float(cost), float(weight)) == pytest.approx(known)
+
+
+def test_an_episode_whose_start_was_not_seen_does_not_count():
+    """And batches of another shape are others' episodes; a loss that loads the state goes on with them."""
+    loss, actor = build("cpo")
+    data, over = batch_of(actor), torch.zeros(4, 7, dtype=torch.bool)
+    over[0, 2] = True
+    drive(data, over, torch.tensor([False, True, True, True]))
+    super(CPOLoss, loss).begin(data)
+    loss.cost_of_policy(data)
+    assert loss.episode.isnan().all()  # the only end is of an episode that began before
+    over = torch.zeros(4, 7, dtype=torch.bool)
+    over[1, 0] = True
+    drive(data, over, torch.zeros(4, dtype=torch.bool))
+    other, _ = build("cpo", seed=3)
+    other.load_state_dict(loss.state_dict())
+    costs = [*data["next", "cost"][1].squeeze(-1).tolist(), float(data["next", "cost"][1, 0])]
+    expected = sum(cost * GAMMA**t for t, cost in enumerate(costs))
+    for each in (loss, other):
+        assert float(each.cost_of_policy(data)[0]) == pytest.approx(expected)
+    (single := batch_of(actor, envs=2))["is_init"].zero_()
+    assert float(loss.cost_of_policy(single)[0]) == pytest.approx(expected)
+    assert loss.running.shape == (2, 4)
+
+
+def test_cost_of_long_episodes_is_not_a_guess_of_the_critic():
+    """A cost of 1 in each of 500 decisions, in batches of 64: the limit is seen to be broken at once."""
+    loss, actor = build("cpo", cost_limit=30.0)
+    loss.make_value_estimator(ValueEstimators.GAE, gamma=0.99, lmbda=0.95)
+    for number in range(9):
+        data = batch_of(actor, steps=64)
+        data["next", "cost"].fill_(1.0)
+        step = torch.arange(64 * number, 64 * number + 64) % 500
+        drive(data, (step == 499).expand(4, 64), torch.full((4,), number == 0))
+        loss.begin(data)
+        out = loss(data.reshape(-1))
+        assert out["cost_estimate"] > 40 and out["cpo_infeasible"] + out["cpo_recoverable"] == 1
+    assert float(out["cost_estimate"]) == pytest.approx((1 - 0.99**500) / 0.01)
+
+
+def test_the_violation_is_stated_per_decision():
+    """(J_c - d) / w goes into the step (docs/pitfalls.md, 7)."""
+    loss, actor = build("cpo", cost_limit=1.2)
+    given = []
+    loss._step = lambda batch, violation: given.append(float(violation))
     data = batch_of(actor)
-    super(CPOLoss, loss).begin(data)
-    cost, weight = loss.cost_of_policy(data)
-    first = data["is_init"].squeeze(-1)
-    torch.testing.assert_close(cost, data["cost_value_target"].squeeze(-1)[first].mean())
-    starts = int(first.sum())
-    length = data.numel() / starts
-    assert float(weight) == pytest.approx((1 - GAMMA**length) / (1 - GAMMA))
-    # No episode begins: the cost that was known, and a length over both batches.
-    data["is_init"].zero_()
-    again, weight = loss.cost_of_policy(data)
-    assert float(again) == pytest.approx(float(cost))
-    length = 1.9 * data.numel() / (0.9 * starts)
-    assert float(weight) == pytest.approx((1 - GAMMA**length) / (1 - GAMMA))
+    loss.begin(data)
+    costs = data["next", "cost"].squeeze(-1)
+    ended = costs[0, :4].tolist(), costs[1, :3].tolist()
+    mean = sum(sum(c * GAMMA**t for t, c in enumerate(each)) for each in ended) / 2
+    weight = sum(sum(GAMMA**t for t in range(len(each))) for each in ended) / 2
+    assert given == [pytest.approx((mean - 1.2) / weight, rel=1e-5)]
 
 
-@pytest.mark.parametrize("gamma", [0.9, 1.0])
-def test_cost_of_an_episode_ends_with_it(gamma: float):
-    """By truncation too, and with gamma=1: what V_c converges to is the sum over the episode that was played."""
-    loss, actor = build("cpo")
-    loss.make_value_estimator(ValueEstimators.GAE, gamma=gamma, lmbda=1.0)
-    data = batch_of(actor, steps=6)
-    for key in ("done", "terminated"):
-        data["next", key].zero_()
-    data["next", "done"][:, 2::3] = True  # two episodes of three decisions, truncated
-    data["is_init"].zero_()[:, 0::3] = True
-    super(CPOLoss, loss).begin(data)
-    cost, weight = loss.cost_of_policy(data)
-    each = data["next", "cost"].reshape(-1, 3) @ (gamma ** torch.arange(3, dtype=torch.float64))
-    assert float(cost) == pytest.approx(float(each.mean()))
-    assert float(weight) == pytest.approx(sum(gamma**t for t in range(3)))
-
-
-def test_length_of_episodes_does_not_jump_with_the_batches():
-    """Ends that fall into few of the batches: 200 decisions an episode, 8 side by side, batches of 128 each."""
-    loss, actor = build("cpo")
-    loss.make_value_estimator(ValueEstimators.GAE, gamma=1.0, lmbda=0.9)
-    data = batch_of(actor, envs=8, steps=128)
-    data["next", "done"].zero_()
-    super(CPOLoss, loss).begin(data)
-    weights = []
-    for number in range(25):
-        step = torch.arange(128) + 128 * number
-        data["is_init"] = (step % 200 == 0)[None, :, None].expand(8, 128, 1)
-        weights.append(float(loss.cost_of_policy(data)[1]))
-    assert all(160 < weight < 250 for weight in weights[5:]), weights
+@pytest.mark.parametrize(
+    ("case", "violation", "step", "taken"),
+    [
+        # reward, cost and KL of a fraction of the step; what it must satisfy, and where that first holds
+        ("feasible", -0.1, lambda f: (f, 0.0, 0.0), 1.0),
+        ("feasible", -0.1, lambda f: (-1.0 if f > 0.5 else 0.0, 0.0, 0.0), 0.5),
+        ("infeasible", 0.1, lambda f: (-1.0, -f, 0.0), 1.0),
+        ("recoverable", 0.1, lambda f: (-1.0, -f, 0.0), 1.0),
+        ("feasible", -0.1, lambda f: (f, 0.11 if f > 0.5 else 0.09, 0.0), 0.5),
+        ("infeasible", 0.1, lambda f: (f, 0.09 if f > 0.5 else 0.0, 0.0), 0.5),
+        ("feasible", -0.1, lambda f: (f, 0.0, 0.011 if f > 0.5 else 0.009), 0.5),
+        ("feasible", -0.1, lambda f: (math.nan if f > 0.5 else f, 0.0, 0.0), 0.5),
+    ],
+)
+def test_the_search_takes_the_longest_step_that_keeps_every_promise(case, violation, step, taken):
+    loss, _ = build("cpo", trust=0.01, backtrack=0.5)
+    parameters = [torch.zeros(1)]
+    loss._surrogates = lambda batch, old: (
+        tuple(map(torch.tensor, step(float(parameters[0]))))
+        if parameters[0]
+        else (torch.tensor(0.0), torch.tensor(0.0), torch.tensor(0.0))
+    )
+    loss._search(TensorDict(), None, parameters, torch.ones(1), case, violation)
+    assert float(parameters[0]) == taken == float(loss.report[2])
 
 
 def test_kl_of_squashed_policies():
@@ -242,8 +313,13 @@ def policy(loss) -> torch.Tensor:
     return flat(p.detach() for p in loss.actor_network_params.values(True, True))
 
 
-@pytest.mark.parametrize("limit", [0.0, 3.9, 4.2, 100.0])
-def test_a_step_keeps_what_it_promises(limit: float):
+@pytest.mark.parametrize("above", [-10.0, -0.02, 0.02, 10.0])
+def test_a_step_keeps_what_it_promises(above: float):
+    """With the limit far or little above or below what the policy costs."""
+    loss, actor = build("cpo", trust=0.02, damping=0.01)
+    data = batch_of(actor, envs=64)
+    super(CPOLoss, loss).begin(data)
+    limit = max(float(loss.cost_of_policy(data)[0]) + above, 0.0)
     loss, actor = build("cpo", cost_limit=limit, trust=0.02, damping=0.01)
     data = batch_of(actor, envs=64)
     before = policy(loss)
@@ -264,13 +340,15 @@ def test_a_step_keeps_what_it_promises(limit: float):
         assert case in ("unconstrained", "feasible") and reward > 0
 
 
-def test_fisher_products_and_direction_match_dense_algebra():
+@pytest.mark.parametrize(
+    ("case", "violation"),
+    [("unconstrained", -10.0), ("feasible", -1e-3), ("recoverable", 1e-3), ("infeasible", 10.0)],
+)
+def test_fisher_products_and_direction_match_dense_algebra(case: str, violation: float):
     """The step that is tried first is the closed-form solution of the quadratic problem (1e-5)."""
-    loss, actor = build("cpo", cost_limit=4.0, damping=0.1, cg_steps=200)
+    loss, actor = build("cpo", damping=0.1, cg_steps=200)
     data = batch_of(actor, envs=16)
     super(CPOLoss, loss).begin(data)
-    cost, weight = loss.cost_of_policy(data)
-    violation = float((cost - loss.cost_limit) / weight)
     flat_data = data.reshape(-1)
     parameters = list(loss.actor_network_params.values(True, True))
     with loss.actor_network_params.to_module(loss.actor_network), torch.no_grad():
@@ -287,12 +365,20 @@ def test_fisher_products_and_direction_match_dense_algebra():
     loss._search = lambda batch, old, parameters, step, case, c: tried.update(step=step, case=case)
     loss._step(flat_data, torch.tensor(violation))
     x = tried["step"]
+    dense = constrained_direction(g, b, violation, lambda v: torch.linalg.solve(H, v), loss.trust)
+    assert tried["case"] == dense.case == case
+    assert (x - dense.step).norm() <= 1e-5 * dense.step.norm() > 0
     # Optimality of a convex problem, with multipliers fitted to the solution.
-    assert 0.5 * x @ H @ x <= loss.trust * (1 + 1e-6)
-    basis = torch.stack([g, -b], 1)
-    weights = torch.linalg.lstsq(basis, (H @ x)[:, None]).solution.squeeze(-1)
-    torch.testing.assert_close(basis @ weights, H @ x, rtol=1e-5, atol=1e-8)
-    assert tried["case"] in CASES and (weights >= -1e-9).all()
+    assert 0.5 * x @ H @ x <= loss.trust * (1 + 1e-5)
+    least = violation - float(torch.sqrt(2 * loss.trust * b @ torch.linalg.solve(H, b)))
+    if case == "infeasible":  # all that the region has against the cost
+        assert float(violation + b @ x) == pytest.approx(least, rel=1e-5) and least > 0
+    else:
+        assert violation + b @ x <= 1e-5 * b.norm() * x.norm() and least <= 0
+    basis = torch.stack([(case != "infeasible") * g, -b], 1)
+    weights = torch.linalg.lstsq(basis, (H @ x)[:, None], driver="gelsd").solution.squeeze(-1)
+    assert (basis @ weights - H @ x).norm() <= 1e-4 * (H @ x).norm()
+    assert (weights >= -1e-6 * weights.abs().max()).all()
 
 
 def test_a_failed_search_restores_the_policy():
