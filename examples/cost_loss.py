@@ -68,7 +68,7 @@ for number, data in enumerate(collector):
     optimizer.zero_grad()
     targets.step()
     ended = data["next"][data["next", "done"].squeeze(-1)]  # fresh episodes, each used once
-    loss.lagrange.update(ended["episode_cost"] - LIMIT)
+    loss.lagrange.update(loss.lagrange.penalty(ended["episode_cost"] - LIMIT))
     if number == 31 + updates:
         break
 

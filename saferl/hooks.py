@@ -54,7 +54,7 @@ class EpisodeSignal:
 
     def __init__(self, cost_limit: float):
         if not cost_limit >= 0:
-            raise ValueError(f"lagrange.signal.cost_limit must be >= 0, got {cost_limit}.")
+            raise ValueError(f"cost_limit must be >= 0, got {cost_limit}.")
         self.cost_limit = cost_limit
 
     def register(self, trainer: Trainer) -> None:
@@ -63,7 +63,8 @@ class EpisodeSignal:
 
     def _update(self, finished: TensorDictBase, spent: float) -> None:
         if len(finished):
-            self._lagrange.update(finished["cost_return"] - self.cost_limit)
+            violation = finished["cost_return"] - self.cost_limit
+            self._lagrange.update(self._lagrange.penalty(violation))
 
 
 class ProjectorProgress:

@@ -20,7 +20,8 @@ class LagrangeMultiplier(nn.Module):
     """A multiplier lambda >= 0 of a constraint ``violation <= 0``: fixed, unless a subclass moves it.
 
     A loss adds ``multiplier.value.detach() * multiplier.penalty(violation)`` to each sample; a
-    training loop calls :meth:`update` with fresh violations, once for each update.
+    training loop calls :meth:`update` with fresh penalties, once for each update: their mean is the
+    Lagrangian's slope in lambda.
 
     A state-wise constraint (``signed=False``) counts only the samples that violate it, and its
     multiplier cannot fall (E11, paper). A signed one averages surplus and shortage.
@@ -58,26 +59,28 @@ class LagrangeMultiplier(nn.Module):
         """The term of each sample that lambda multiplies, [*B]: ReLU or identity."""
         return violation if self.signed else F.relu(violation)
 
-    def _mean(self, violation: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean penalty of the finite entries (float64), and whether there is one."""
-        violation = violation.detach().to(self.value)
-        finite = violation.isfinite()
-        total = self.penalty(torch.where(finite, violation, 0.0)).sum()
+    def _mean(self, penalty: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean of the finite entries (float64), and whether there is one."""
+        penalty = penalty.detach().to(self.value)
+        finite = penalty.isfinite()
+        total = torch.where(finite, penalty, 0.0).sum()
         return total / finite.sum().clamp(min=1), finite.any()
 
-    def update(self, violation: Tensor) -> None:
-        """Moves the multiplier by a violation of any shape, which is averaged; here, not at all.
+    def update(self, penalty: Tensor) -> None:
+        """Moves the multiplier by penalties of any shape, which are averaged; here, not at all.
 
-        Entries that are not finite are left out; with none left (or an empty tensor) nothing
-        changes, so one bad batch cannot turn the multiplier into NaN.
+        A loss reports theirs as ``"constraint_violation"``; for violations of your own,
+        ``multiplier.update(multiplier.penalty(violation))``. Entries that are not finite are left
+        out; with none left (or an empty tensor) nothing changes, so one bad batch cannot turn the
+        multiplier into NaN.
         """
 
 
 class DualAscent(LagrangeMultiplier):
     """Projected gradient ascent on the dual (E7 and E11, paper).
 
-    lambda <- max(0, lambda + lr * mean(penalty(violation))), where penalty is ReLU by default
-    (as E11 prints it: the multiplier can only grow) and the identity if ``signed``.
+    lambda <- max(0, lambda + lr * mean(penalty)), where the penalty of a violation is its ReLU by
+    default (as E11 prints it: the multiplier can only grow) and the violation itself if ``signed``.
 
     Args:
         init: first value.
@@ -108,15 +111,15 @@ class DualAscent(LagrangeMultiplier):
         self.lr = _check("lr", lr, positive=True)
 
     @torch.no_grad()
-    def update(self, violation: Tensor) -> None:
-        mean, _ = self._mean(violation)
+    def update(self, penalty: Tensor) -> None:
+        mean, _ = self._mean(penalty)
         self.value.copy_((self.value + self.lr * mean).clamp(0.0, self.maximum))
 
 
 class PIDMultiplier(LagrangeMultiplier):
     """PID control of the multiplier (Stooke, Achiam and Abbeel, 2020, Algorithm 2).
 
-    With e the mean violation and e' the one before it:
+    With e the mean penalty, which is the mean violation if ``signed``, and e' the one before it:
     I <- clip(I + ki * e, 0, maximum), lambda <- clip(kp * e + I + kd * max(0, e - e'), 0, maximum).
 
     The integral is kept in units of lambda and clipped at every step (anti-windup), so that it lets
@@ -167,8 +170,8 @@ class PIDMultiplier(LagrangeMultiplier):
         self.register_buffer("started", torch.tensor(False))
 
     @torch.no_grad()
-    def update(self, violation: Tensor) -> None:
-        mean, known = self._mean(violation)
+    def update(self, penalty: Tensor) -> None:
+        mean, known = self._mean(penalty)
         rise = torch.where(self.started, F.relu(mean - self.previous), 0.0)
         integral = (self.integral + self.ki * mean).clamp(0.0, self.maximum)
         value = (self.kp * mean + integral + self.kd * rise).clamp(0.0, self.maximum)

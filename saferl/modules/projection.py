@@ -80,8 +80,8 @@ def _descend(
     steps: int,
     step_size: float,
     penalty: float,
-    low: float,
-    high: float,
+    low: float | Tensor,
+    high: float | Tensor,
 ) -> _Descent:
     """Up to ``steps`` steps of the samples that are still active."""
     for _ in range(steps):
@@ -93,7 +93,7 @@ def _descend(
         # A gradient that is not finite cannot say where to go: the sample stops like at g = 0.
         active = at.active & (norm > 0) & norm.isfinite()
         scale = torch.where(active, step_size / norm, 0.0).unsqueeze(-1)
-        moved = (at.action - scale * gradient).clamp(low, high)
+        moved = (at.action - scale * gradient).clamp(low, high)  # pyright: ignore
         action = torch.where(active.unsqueeze(-1), moved, at.action)
         risk, slope = _evaluate(risk_fn, action)
         better = active & (risk < at.least)
@@ -125,8 +125,8 @@ def project(
     step_size: float = 0.02,
     penalty: float = 1.0,
     keep: str = "last",
-    low: float = -1.0,
-    high: float = 1.0,
+    low: float | Tensor = -1.0,
+    high: float | Tensor = 1.0,
     compile: bool = False,
 ) -> ProjectionResult:
     """Moves risky actions until their risk is at most ``limit`` (paper, E8 to E10).
@@ -163,8 +163,8 @@ def project(
         penalty: lambda_a, the weight of the excess risk against the distance to a_init.
         keep: what a sample that stays infeasible gets: ``"last"`` iterate (paper) or the
             ``"safest"``, the one of least risk, a_init included.
-        low: lower end of the box, for every coordinate.
-        high: upper end of the box.
+        low: lower end of the box, of all coordinates or of each [A].
+        high: upper end of the box, likewise.
         compile: whether to compile the steps, several of them into one function, anew for each shape of
             ``action`` and each setting; beyond a few of them (torch's ``recompile_limit``) the rest run
             as they are. The result is the same up to rounding.
@@ -216,7 +216,13 @@ def project(
 
 
 def _check_arguments(
-    limit: float, steps: int, step_size: float, penalty: float, keep: str, low: float, high: float
+    limit: float,
+    steps: int,
+    step_size: float,
+    penalty: float,
+    keep: str,
+    low: float | Tensor,
+    high: float | Tensor,
 ) -> None:
     if torch.is_inference_mode_enabled():
         raise RuntimeError("project needs gradients: use torch.no_grad, not inference_mode.")
@@ -230,5 +236,5 @@ def _check_arguments(
         raise ValueError(f"penalty must be finite and >= 0, got {penalty}.")
     if keep not in ("last", "safest"):
         raise ValueError(f"keep must be 'last' or 'safest', got {keep!r}.")
-    if not low < high:
+    if not torch.as_tensor(low < high).all():
         raise ValueError(f"low must be below high, got low={low} and high={high}.")

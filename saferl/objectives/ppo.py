@@ -44,7 +44,7 @@ class PPOLagLoss(CostValueLoss, ClipPPOLoss):
     with :math:`\rho` the ratio of the new policy's probability to the one that acted. The sum is
     standardised after the two advantages are weighed, never one of them before, so that the multiplier is
     in units of reward per cost. The multiplier is moved by the loop, once for each batch of fresh episodes:
-    ``loss.lagrange.update(episode_cost - limit)``.
+    ``loss.lagrange.update(loss.lagrange.penalty(episode_cost - limit))``.
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): the policy.

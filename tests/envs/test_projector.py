@@ -10,6 +10,7 @@ from echo import EchoEnv
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.data import (
+    Bounded,
     LazyTensorStorage,
     ReplayBuffer,
     TensorDictReplayBuffer,
@@ -202,6 +203,24 @@ def test_report_is_in_policy_units():
     data = composed.rollout(3)
     torch.testing.assert_close(data["next", "felt"], 5 * data["next", "action_executed"])
     assert data["next", "intervened"].any()
+
+
+@pytest.mark.parametrize(("low", "high"), [((-2.0, -2.0), (2.0, 2.0)), ((-1.5, 0.5), (3.0, 2.0))])
+def test_the_box_is_the_environments(low, high):
+    """Whatever its size, equal or not in each coordinate: nothing moves further than the steps go."""
+    low, high = torch.tensor(low).expand(4, 2), torch.tensor(high).expand(4, 2)
+    inner = EchoEnv((4,))
+    inner.action_spec = Bounded(low=low, high=high, shape=(4, 2))
+    env = TransformedEnv(inner, projector(steps=3, step_size=0.02))
+    data = env.rollout(20)
+    step = data["next"]
+    moved = (step["action_executed"] - data["action"]).abs()
+    assert step["intervened"].any() and moved.max() <= 0.06 + 1e-6
+    assert (data["action"].abs() > 1).any()
+    far = TransformedEnv(inner, projector(steps=300, step_size=0.02, penalty=1e4)).rollout(20)
+    executed = far["next", "action_executed"]
+    assert (executed >= low[:, None]).all() and (executed <= high[:, None]).all()
+    check(far)
 
 
 def test_start_of_the_correction():

@@ -22,7 +22,7 @@ def test_dual_ascent_recursion(sequence, init, lr, signed, room):
     multiplier = DualAscent(init, lr, signed, maximum=init + room)
     value = init
     for violation in sequence:
-        multiplier.update(torch.tensor(violation, dtype=torch.float64))
+        multiplier.update(multiplier.penalty(torch.tensor(violation, dtype=torch.float64)))
         value += lr * (violation if signed else max(0.0, violation))
         value = min(max(value, 0.0), init + room)
         assert multiplier.value.item() == pytest.approx(value, abs=1e-12)
@@ -35,7 +35,7 @@ def test_pid_recursion(sequence, gains, init, signed):
     multiplier = PIDMultiplier(kp, ki, kd, init, signed, maximum=5.0)
     integral, previous = init / ki, None
     for violation in sequence:
-        multiplier.update(torch.tensor(violation, dtype=torch.float64))
+        multiplier.update(multiplier.penalty(torch.tensor(violation, dtype=torch.float64)))
         error = violation if signed else max(0.0, violation)
         integral = min(max(0.0, integral + error), 5.0 / ki)
         rise = 0.0 if previous is None else max(0.0, error - previous)
@@ -55,7 +55,7 @@ def test_a_tensor_is_averaged_after_the_penalty(make):
     violation = torch.tensor([[[-1.0], [3.0]], [[0.5], [-4.0]]])
     for signed, mean in ((False, 3.5 / 4), (True, -1.5 / 4)):
         by_tensor, by_mean = make(init=1.0, signed=signed), make(init=1.0, signed=signed)
-        by_tensor.update(violation)
+        by_tensor.update(by_tensor.penalty(violation))
         by_mean.update(torch.tensor(mean))
         torch.testing.assert_close(by_tensor.value, by_mean.value)
 
@@ -70,6 +70,20 @@ def test_penalty():
     assert (state_wise.value * violation).dtype == torch.float32
 
 
+class Steep(DualAscent):
+    def penalty(self, violation):
+        return super().penalty(violation) + 5 * violation.clamp(min=0).square()
+
+
+def test_a_penalty_of_ones_own_counts_once():
+    """What moves the multiplier is the slope of the Lagrangian, and not the penalty of a penalty."""
+    multiplier = Steep(init=1.0, lr=0.1)
+    violation = torch.tensor([1.0, -1.0])
+    lagrangian = multiplier.penalty(violation).mean()  # times lambda
+    multiplier.update(lagrangian)
+    assert multiplier.value.item() == pytest.approx(1.0 + 0.1 * 6 / 2)
+
+
 def test_base_class_is_a_fixed_multiplier():
     multiplier = LagrangeMultiplier(init=0.7)
     multiplier.update(torch.tensor(5.0))
@@ -79,8 +93,8 @@ def test_base_class_is_a_fixed_multiplier():
 def test_state_wise_ascent_never_falls_and_signed_never_goes_negative():
     state_wise, signed = DualAscent(1.0, 0.1), DualAscent(1.0, 0.1, signed=True)
     for _ in range(100):
-        state_wise.update(torch.tensor(-1.0))
-        signed.update(torch.tensor(-1.0))
+        for multiplier in (state_wise, signed):
+            multiplier.update(multiplier.penalty(torch.tensor(-1.0)))
     assert state_wise.value.item() == 1.0
     assert signed.value.item() == 0.0
     signed.update(torch.tensor(1.0))

@@ -6,13 +6,14 @@ import functools
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torchrl.data import Binary, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
 from saferl.modules.compiling import compiled
@@ -53,7 +54,7 @@ class SafetyProjector(Transform):
     """Executes a corrected action wherever the risk of the proposed one exceeds a limit.
 
     The correction is :func:`saferl.modules.project` (paper, E8 to E10) on the risk
-    Q_c(s, a) that ``risk`` predicts. Append it outermost, outside a ``SerialEnv`` or
+    Q_c(s, a) that ``risk`` predicts, within the box of the environment's action spec. Append it outermost, outside a ``SerialEnv`` or
     ``ParallelEnv``: it then meets the policy's own action, random warm-up actions included, with
     all environments in one batch. ``action`` in collected data stays the proposed one, whose
     log-probability the policy knows; :class:`ExecutedAction` swaps it in an off-policy buffer.
@@ -65,11 +66,9 @@ class SafetyProjector(Transform):
             does not depend on the action is computed once for all steps.
         limit: d_thres, the largest risk that is left alone.
         steps: N_iter, the largest number of correction steps.
-        step_size: eta, the largest move of a coordinate in a step.
+        step_size: eta, the largest move of a coordinate in a step, in the units of the action.
         penalty: lambda_a, see :func:`saferl.modules.project`.
         keep: ``"last"`` or ``"safest"``, what is executed where no step reached the limit.
-        low: lower end of the action box.
-        high: upper end of the action box.
         start: fraction of a run after which the correction acts, see :meth:`set_progress`; with 0
             it acts from the first step on, as printed in Algorithm 1.
         compile: whether it is compiled, the correction in parts of at most 32 states.
@@ -116,8 +115,6 @@ class SafetyProjector(Transform):
         step_size: float = 0.02,
         penalty: float = 1.0,
         keep: str = "last",
-        low: float = -1.0,
-        high: float = 1.0,
         start: float = 0.0,
         compile: bool = False,
         action_key: NestedKey = "action",
@@ -132,13 +129,11 @@ class SafetyProjector(Transform):
             )
         self.risk = risk
         self.limit = float(limit)
-        self.settings = {
+        self.settings: dict[str, Any] = {
             "steps": steps,
             "step_size": step_size,
             "penalty": penalty,
             "keep": keep,
-            "low": low,
-            "high": high,
         }
         # Refuses bad settings now and not in the middle of a run.
         project(lambda action: action.sum(-1), torch.zeros(0, 1), self.limit, **self.settings)
@@ -147,6 +142,7 @@ class SafetyProjector(Transform):
         self.start = float(start)
         self.action_key = action_key
         self.enabled = start == 0.0  # no tensor: to ask a GPU would be to wait for it
+        self._box: dict[str, Any] | None = None
 
     def get_extra_state(self) -> bool:
         return self.enabled
@@ -180,6 +176,22 @@ class SafetyProjector(Transform):
         missing = -len(rows) % size
         return torch.cat([rows, rows[-1:].expand(missing)]).split(size)
 
+    def _bounds(self) -> dict[str, Any]:
+        """``low`` and ``high`` of the environment's actions: numbers where all coordinates share them."""
+        if self._box is None:
+            env = self.parent
+            if env is None:
+                raise RuntimeError("SafetyProjector must be appended to an environment.")
+            spec = env.full_action_spec[self.action_key]
+            ends: dict[str, Any] = {"low": -torch.inf, "high": torch.inf}
+            if isinstance(spec, Bounded):
+                ends = {name: getattr(spec.space, name) for name in ends}
+                ends = {name: end.reshape(-1, end.shape[-1])[0] for name, end in ends.items()}
+                if all((end == end[0]).all() for end in ends.values()):
+                    ends = {name: float(end[0]) for name, end in ends.items()}
+            self._box = ends
+        return self._box
+
     @torch.no_grad()
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         inputs = tensordict.select(*self.risk.in_keys).reshape(-1)
@@ -194,7 +206,7 @@ class SafetyProjector(Transform):
                 # Only the risky samples are worth up to `steps` evaluations.
                 if isinstance(rows, Tensor):
                     risk, _ = self._look(inputs[rows])
-                result = project(risk, action[rows], self.limit, **self.settings)
+                result = project(risk, action[rows], self.limit, **self.settings, **self._bounds())
                 executed[rows], after[rows] = result.action, result.risk_after
                 steps[rows] = result.steps.to(steps)
             self.latencies.append(time.perf_counter() - begin)
@@ -231,6 +243,7 @@ class SafetyProjector(Transform):
         env = self.parent
         if env is None:
             raise RuntimeError("SafetyProjector must be appended to an environment.")
+        self._box = None  # it may be another environment than before
         action = env.full_action_spec[self.action_key]
         report = observation_spec.clone()
         report["action_executed"] = Unbounded(
