@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import distance_loss
 
-from saferl.objectives.checks import check_cost, check_gamma
+from saferl.objectives.checks import check_begun, check_cost, check_gamma
 
 
 class CostValueLoss(LossModule):
@@ -31,6 +31,11 @@ class CostValueLoss(LossModule):
     cost_critic: TensorDictModule
     cost_critic_params: TensorDictParams
     target_cost_critic_params: TensorDictParams
+
+    #: What a subclass's forward reads: the observations of these networks, and these entries, by
+    #: their names in ``tensor_keys``.
+    _networks: tuple[str, ...]
+    _entries: tuple[str, ...]
 
     # Of the loss beside this base, or made late.
     tensor_keys: Any
@@ -75,6 +80,13 @@ class CostValueLoss(LossModule):
                 terminated=keys.done,
             )
 
+    def _set_in_keys(self) -> None:
+        # The other base asks before the cost critic is there.
+        networks = [getattr(self, name) for name in self._networks if hasattr(self, name)]
+        keys = [key for network in networks for key in network.in_keys]
+        keys += [getattr(self.tensor_keys, name) for name in self._entries]
+        self._in_keys = list(dict.fromkeys(keys))
+
     @torch.no_grad()
     def begin(self, tensordict: TensorDictBase) -> None:
         """Write the advantages of a batch of fresh transitions.
@@ -108,6 +120,7 @@ class CostValueLoss(LossModule):
         Args:
             tensordict: ``[*B]`` as :meth:`begin` leaves it.
         """
+        check_begun(tensordict, self.tensor_keys.cost_value_target)
         with self.cost_critic_params.to_module(self.cost_critic, preserve_module_state=False):
             inputs = tensordict.select(*self.cost_critic.in_keys)
             predicted = self.cost_critic(inputs).get(self.tensor_keys.state_cost_value)

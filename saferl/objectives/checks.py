@@ -8,6 +8,8 @@ from typing import Any
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
+from saferl.modules import LagrangeMultiplier
+
 
 def check_limit(cost_limit: float) -> float:
     """A limit on costs, in their unit.
@@ -43,6 +45,30 @@ def check_cost(tensordict: TensorDictBase, key: NestedKey) -> None:
             f"{sorted(map(str, tensordict.get('next').keys()))}. "
             "Name your cost with loss.set_keys(cost=...)."
         )
+
+
+def check_begun(tensordict: TensorDictBase, key: NestedKey) -> None:
+    """That a batch ``[*B]`` holds what ``begin`` writes.
+
+    Raises:
+        KeyError: it does not.
+    """
+    if tensordict.get(key, None) is None:
+        raise KeyError(
+            f"The batch has no entry {key!r}: loss.begin(data) writes it into a whole batch "
+            "[*B, T] of fresh transitions, before it is cut into mini-batches."
+        )
+
+
+def check_lagrange(lagrange: Any) -> LagrangeMultiplier:
+    """A multiplier.
+
+    Raises:
+        ValueError: it is something else.
+    """
+    if not isinstance(lagrange, LagrangeMultiplier):
+        raise ValueError(f"lagrange must be a LagrangeMultiplier, got {lagrange!r}.")
+    return lagrange
 
 
 def check_members(name: str, members: Any) -> None:

@@ -16,7 +16,7 @@ from torchrl.objectives.utils import distance_loss
 
 from saferl.modules import BoundCritics, CriticEnsemble, LagrangeMultiplier, Largest
 from saferl.modules.critics import REDUCTIONS
-from saferl.objectives.checks import check_cost, check_gamma, check_limit
+from saferl.objectives.checks import check_cost, check_gamma, check_lagrange, check_limit
 
 #: What the cost critics' target may be of its members' values.
 COST_TARGETS = ("max", "mean")
@@ -115,13 +115,11 @@ class CostCriticLoss(LossModule):
             create_target_params=create_target_params,
             compare_against=compare_against,
         )
-        if not isinstance(lagrange, LagrangeMultiplier):
-            raise ValueError(f"lagrange must be a LagrangeMultiplier, got {lagrange!r}.")
         if not callable(self.risk):
             raise ValueError(
                 f"risk must be a function, such as saferl.modules.Largest(), got {risk!r}."
             )
-        self.lagrange = lagrange
+        self.lagrange = check_lagrange(lagrange)
         device = next(self.parameters()).device
         self.register_buffer("cost_limit", torch.tensor(cost_limit, device=device))
         # Made here, not at the first call: a fresh loss then loads a state_dict strictly.

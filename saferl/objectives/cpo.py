@@ -13,7 +13,7 @@ from torch.distributions import Distribution, Independent, TransformedDistributi
 from torchrl.objectives import PPOLoss
 
 from saferl.objectives.advantages import CostValueLoss
-from saferl.objectives.checks import check_limit
+from saferl.objectives.checks import check_begun, check_limit
 from saferl.objectives.ppo import CostKeys
 from saferl.objectives.trust_region import (
     CASES,
@@ -114,6 +114,8 @@ class CPOLoss(CostValueLoss, PPOLoss):
 
     _AcceptedKeys = CostKeys
     default_keys = CostKeys
+    _networks = ("critic_network", "cost_critic")
+    _entries = ("value_target", "cost_value_target")
 
     cost_limit: Tensor
     report: Tensor
@@ -156,6 +158,8 @@ class CPOLoss(CostValueLoss, PPOLoss):
         self._add_cost_value(cost_critic)
         device = next(self.parameters()).device
         self.register_buffer("cost_limit", torch.tensor(check_limit(cost_limit), device=device))
+        self.out_keys = ["loss_critic", "loss_cost", "explained_variance", "kl", "cost_estimate"]
+        self.out_keys += ["step_fraction", *(f"cpo_{name}" for name in CASES)]
         self.trust, self.cg_steps, self.damping = trust, cg_steps, damping
         self.search_steps, self.backtrack = search_steps, backtrack
         # Of the last step: KL, J_c, fraction of the step, number of the case.
@@ -325,6 +329,7 @@ class CPOLoss(CostValueLoss, PPOLoss):
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        check_begun(tensordict, self.tensor_keys.value_target)
         tensordict = tensordict.clone(False)
         loss_critic, _, explained = self.loss_critic(tensordict)
         kl, cost, fraction, case = self.report.clone().unbind()

@@ -12,6 +12,7 @@ from torchrl.objectives import ClipPPOLoss
 
 from saferl.modules import LagrangeMultiplier
 from saferl.objectives.advantages import CostValueLoss
+from saferl.objectives.checks import check_begun, check_lagrange
 
 
 @dataclass
@@ -63,7 +64,7 @@ class PPOLagLoss(CostValueLoss, ClipPPOLoss):
     ``"lagrange_multiplier"``.
 
     Raises:
-        ValueError: ``clip_epsilon`` is not positive, or ``gamma`` lies outside [0, 1].
+        ValueError: ``clip_epsilon`` is not positive, ``lagrange`` is no multiplier, or ``gamma`` lies outside [0, 1].
         KeyError: the batch holds no cost, or ``begin`` has not seen it.
 
     Examples:
@@ -93,6 +94,11 @@ class PPOLagLoss(CostValueLoss, ClipPPOLoss):
 
     _AcceptedKeys = CostKeys
     default_keys = CostKeys
+    _networks = ("actor_network", "critic_network", "cost_critic")
+    _entries = (
+        *("action", "sample_log_prob", "advantage", "value_target"),
+        *("cost_advantage", "cost_value_target"),
+    )
 
     lagrange: LagrangeMultiplier
 
@@ -129,10 +135,13 @@ class PPOLagLoss(CostValueLoss, ClipPPOLoss):
             reduction=reduction,
         )
         self._add_cost_value(cost_critic)
-        self.lagrange = lagrange
+        self.lagrange = check_lagrange(lagrange)
+        self.out_keys = [*self.out_keys, "loss_cost", "lagrange_multiplier"]
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        for key in (self.tensor_keys.advantage, self.tensor_keys.cost_advantage):
+            check_begun(tensordict, key)
         reward = tensordict.get(self.tensor_keys.advantage)
         cost = tensordict.get(self.tensor_keys.cost_advantage)
         multiplier = self.lagrange.value.detach().to(reward)

@@ -427,7 +427,45 @@ def test_cpo_refuses(setting: dict, message: str):
         build("cpo", **setting)
 
 
+@pytest.mark.parametrize("kind", LOSSES)
+def test_dispatch_without_a_tensordict(kind: str):
+    """By the entries that ``in_keys`` names, in the order of ``out_keys``."""
+    loss, actor = build(kind)
+    data = batch_of(actor)
+    loss.begin(data)
+    flat_data = data.reshape(-1)
+    expected = loss(flat_data)
+    entries = {key: flat_data.get(key) for key in loss.in_keys}
+    assert all(isinstance(key, str) for key in entries)
+    outputs = loss(**entries)
+    assert len(outputs) == len(loss.out_keys) > 5
+    for key, value in zip(loss.out_keys, outputs, strict=True):
+        torch.testing.assert_close(value, expected[key], equal_nan=True)
+    # No more and no less than these is read.
+    assert set(loss(flat_data.select(*loss.in_keys)).keys()) == set(expected.keys())
+
+
+@pytest.mark.parametrize("kind", LOSSES)
+def test_a_batch_that_begin_has_not_seen(kind: str):
+    loss, actor = build(kind)
+    with pytest.raises(KeyError, match=r"no entry '\w+': loss.begin"):
+        loss(batch_of(actor).reshape(-1))
+
+
+def test_cpo_leaves_parameters_that_the_policy_does_not_use():
+    torch.manual_seed(0)
+    actor = tanh_gaussian_actor(encoder(), 8, 2, in_keys=["observation"]).double()
+    spare = torch.nn.Parameter(torch.ones(3, dtype=torch.float64))
+    actor.module[0].register_parameter("spare", spare)
+    values = value("state_value").double(), value("state_cost_value").double()
+    loss = CPOLoss(actor, *values, cost_limit=100.0)
+    loss.begin(batch_of(actor))
+    assert loss.report[2] > 0 and (spare == 1).all()
+
+
 def test_ppo_lag_refuses():
+    with pytest.raises(ValueError, match="lagrange must be a LagrangeMultiplier, got 1.0"):
+        build(lagrange=1.0)
     with pytest.raises(ValueError, match="clip_epsilon must be > 0, got -1"):
         build(clip_epsilon=-1)
 
