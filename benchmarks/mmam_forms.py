@@ -8,8 +8,8 @@ that it has not seen:
 
 - the policy's encoder (``keys``): what would the cautious driver do here? Mean squared error on
   actions in [-1, 1].
-- the value (``branch``): which reward, and which cost, followed? Errors of the two discounted sums, in
-  standard deviations of what followed.
+- the value (``branch``): which reward, and which cost, followed? Mean squared errors of the two discounted
+  sums, in variances of what followed.
 
 Prints the errors of each seed, and the mean difference between forms with Student's 95% interval.
 """
