@@ -16,7 +16,15 @@ from torchrl.objectives import LossModule, ValueEstimators
 from saferl.checkpoint import latest, load_component, run_config
 from saferl.components import Fitting, Networks
 from saferl.envs.transforms import SafetyProjector
-from saferl.modules import StateValue, tanh_gaussian_actor, value_operator, zero_output
+from saferl.modules import (
+    CVaR,
+    Largest,
+    MeanStd,
+    StateValue,
+    tanh_gaussian_actor,
+    value_operator,
+    zero_output,
+)
 
 
 def device_of(cfg: DictConfig) -> torch.device:
@@ -87,18 +95,36 @@ def _check_parts(cfg: DictConfig) -> None:
             f"projector needs cost critics Q_c(s, a), which {loss} has not: "
             "set projector=none, or loss=sac_lag."
         )
-    risk = cfg.risk._target_
-    if risk != "saferl.modules.Largest" and "risk" not in takes:
-        raise ValueError(f"{loss} takes no risk, got {risk}: set risk=largest, or loss=sac_lag.")
-    if risk == "saferl.modules.CVaR" and cfg.cost_critic.get("outputs", 1) == 1:
+    risk = hydra.utils.get_object(cfg.risk._target_)
+
+    def risk_is(kind: type) -> bool:
+        return isinstance(risk, type) and issubclass(risk, kind)
+
+    if not risk_is(Largest) and "risk" not in takes:
+        raise ValueError(
+            f"{loss} takes no risk, got {cfg.risk._target_}: set risk=largest, or loss=sac_lag."
+        )
+    if risk_is(CVaR) and cfg.cost_critic.get("outputs", 1) == 1:
         raise ValueError("risk=cvar is of quantiles: set cost_critic=quantile.")
-    if risk == "saferl.modules.MeanStd" and cfg.cost_critic.members == 1:
+    if risk_is(MeanStd) and cfg.cost_critic.members == 1:
         raise ValueError("risk=mean_std is of several members: set cost_critic=ensemble.")
+    if cfg.get("cost_backup", "sum") != "sum" and "cost_backup" not in takes:
+        raise ValueError(
+            f"{loss} learns no Q_c(s, a): set cost_backup=sum, or loss=sac_lag, "
+            f"got cost_backup={cfg.cost_backup}."
+        )
     for name in ("critic", "cost_critic"):
-        if fresh and cfg[name].members > 1:
+        if not fresh:
+            break
+        if cfg[name].members > 1:
             raise ValueError(
                 f"{loss} has one state value: set {name}=single, got {cfg[name].members} members."
             )
+        for key, plain in (("outputs", 1), ("layer_norm", False)):
+            if cfg[name].get(key, plain) != plain:
+                raise ValueError(
+                    f"{name}.{key} is of action values, which {loss} has not, got {cfg[name][key]}."
+                )
 
 
 def build_agent(cfg: DictConfig) -> Agent:

@@ -142,10 +142,23 @@ def build_experience(cfg: DictConfig, agent: Agent, scenario: Any) -> Replay | E
     Raises:
         ValueError: the loss cannot learn from what is configured.
     """
-    fresh = on_policy(cfg)
-    if fresh != cfg.experience._target_.endswith("Epochs"):
-        name, loss = "epochs" if fresh else "replay", cfg.loss._target_
-        raise ValueError(f"{loss} learns from experience={name}, got {cfg.experience._target_}.")
+    fresh, loss_name = on_policy(cfg), cfg.loss._target_
+    if fresh != issubclass(hydra.utils.get_class(cfg.experience._target_), Epochs):
+        name = "epochs" if fresh else "replay"
+        raise ValueError(
+            f"{loss_name} learns from experience={name}, got {cfg.experience._target_}."
+        )
+    demonstrations = cfg.get("demonstrations")  # a run from before this setting has none
+    if demonstrations and fresh:
+        raise ValueError(
+            f"demonstrations are for a replay buffer, which {loss_name} has not: "
+            f"set demonstrations=0, got {demonstrations}."
+        )
+    if demonstrations and not isinstance(scenario, Scenario):
+        raise ValueError(
+            f"demonstrations are of drivers on a road, which task={scenario.task} has not: "
+            f"set demonstrations=0, got {demonstrations}."
+        )
     device = device_of(cfg)
     generator = torch.Generator(device).manual_seed(cfg.seed)
     keys = (*observed(cfg), *(("next", key) for key in observed(cfg)))
@@ -173,12 +186,6 @@ def build_experience(cfg: DictConfig, agent: Agent, scenario: Any) -> Replay | E
         stored = (*keys, *STORED, *ADVANTAGES)
         return make(
             cfg.experience, buffer=buffer, stored=stored, begin=begin, reward_scale=cfg.reward_scale
-        )
-    demonstrations = cfg.get("demonstrations")  # a run from before this setting has none
-    if demonstrations and not isinstance(scenario, Scenario):
-        raise ValueError(
-            f"demonstrations are of drivers on a road, which task={scenario.task} has not: "
-            f"set demonstrations=0, got {demonstrations}."
         )
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(cfg.buffer_size, device=device),

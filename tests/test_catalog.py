@@ -36,3 +36,13 @@ def test_prints_all_or_what_is_asked_for(capsys):
     assert all(f"{group}=\n" in out for group in GROUPS)
     with pytest.raises(SystemExit, match="error: group must be one of algo, .*, got 'alog'"):
         main(["alog"])
+
+
+def test_lists_a_users_own_folder_too(capsys, tmp_path: Path):
+    (tmp_path / "algo").mkdir()
+    (tmp_path / "algo/mine.yaml").write_text("# @package _global_\n# Better than theirs.\n")
+    main(["algo", "--config-dir", str(tmp_path)])
+    out = capsys.readouterr().out
+    assert "Better than theirs." in out and "  arsac " in out
+    with pytest.raises(SystemExit, match="error: --config-dir: no such folder: nowhere"):
+        main(["algo", "--config-dir", "nowhere"])

@@ -7,7 +7,7 @@ from pathlib import Path
 import hydra
 import pytest
 from omegaconf import OmegaConf
-from small import SMALL, compose
+from small import EMPTY, SMALL, compose
 
 from saferl.agents import build_agent
 from saferl.builders import build_trainer
@@ -100,9 +100,33 @@ def test_option_builds_or_is_refused_with_the_reason(option: str, tmp_path: Path
     build_trainer(cfg, tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("algo=cpo", "demonstrations=8"), "demonstrations are for a replay buffer"),
+        (("algo=cpo", "cost_backup=reach"), "set cost_backup=sum, or loss=sac_lag"),
+        (("algo=sac", "cost_backup=reach"), "set cost_backup=sum, or loss=sac_lag"),
+        (("algo=cpo", "+cost_critic.outputs=16"), "cost_critic.outputs is of action values"),
+        (("algo=ppo", "+critic.layer_norm=true"), "critic.layer_norm is of action values"),
+    ],
+)
+def test_an_option_that_nothing_would_read_is_refused(options, message: str, tmp_path: Path):
+    with pytest.raises(ValueError, match=message):
+        build_trainer(compose(*SMALL, *EMPTY, *options), tmp_path)
+
+
+@pytest.mark.parametrize("algo", ["sac_lag", "ppo_lag"])
+@pytest.mark.parametrize("lagrange", ["episode", "batch", "pid_episode"])
+def test_every_multiplier_of_episodes_goes_with_every_loss(algo, lagrange, tmp_path: Path):
+    cfg = compose(*SMALL, *EMPTY, f"algo={algo}", f"lagrange={lagrange}")
+    build_trainer(cfg, tmp_path).train()
+
+
 #: Ways to compose a task with its environment, small.
 TASKS = {
     "batched": ("task=mixed", "env=batched", "task.vehicles=0"),
+    "lt": ("task=lt", "env=batched", "task.vehicles=0"),
+    "rt": ("task=rt", "env=batched", "task.vehicles=0"),
     "highway": ("task=gs", "env=highway", "task.vehicles=3"),
     "cart": ("task=cart",),
     "gym": ("task=gym", *BESIDE["task=gym"]),
@@ -113,7 +137,7 @@ TASKS = {
 @pytest.mark.parametrize("algo", ALGOS)
 def test_algorithm_builds_and_makes_updates(algo: str, task: str, tmp_path: Path):
     """On every kind of task, or it is refused with the reason."""
-    options = (f"algo={algo}", *TASKS[task], "frames=12")
+    options = (f"algo={algo}", *TASKS[task], "frames=14")
     cfg = compose(*SMALL, *options)
     if task in ("cart", "gym"):
         if cfg.task.get("reward"):
@@ -127,8 +151,10 @@ def test_algorithm_builds_and_makes_updates(algo: str, task: str, tmp_path: Path
                 build_trainer(cfg, tmp_path)
             return
     trainer = build_trainer(cfg, tmp_path)
+    if task in ("lt", "rt"):  # trained as "mixed"
+        return
     trainer.train()
-    assert trainer.progress.frames >= 12 and trainer.progress.updates >= 2
+    assert trainer.progress.frames >= 12 and trainer.progress.updates >= 3
     assert (tmp_path / "metrics.csv").read_text().count("\n") >= 2
 
 

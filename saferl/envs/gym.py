@@ -74,12 +74,13 @@ class GymTask:
         return env
 
     def complete(self) -> dict[str, int]:
-        """What is left open of ``size``, ``action_dim`` and ``horizon``, from the environment itself.
+        """What is left open of ``size``, ``action_dim`` and ``horizon``, from the environment itself, of
+        which one step is tried.
 
         Raises:
-            ValueError: what is not open differs from it.
+            ValueError: what is not open differs from it; or a step tells no cost, or no finite number.
         """
-        env = self.make()
+        env = _Cost(self.make(), self.cost_key)
         limit = gymnasium.spec(self.id.rpartition(":")[2]).max_episode_steps
         if self.horizon is None and limit is None:
             raise ValueError(f"task.horizon must be given: {self.id} has no time limit of its own.")
@@ -87,6 +88,9 @@ class GymTask:
             "size": gymnasium.spaces.flatdim(env.observation_space),
             "action_dim": env.action_space.shape[0],  # pyright: ignore[reportOptionalSubscript]
         }
+        env.action_space.seed(0)
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
         env.close()
         for key, value in found.items():
             if getattr(self, key) not in (None, value):

@@ -71,11 +71,22 @@ def check_lagrange(lagrange: Any) -> LagrangeMultiplier:
     return lagrange
 
 
-def check_members(name: str, members: Any) -> None:
-    """That the members of an ensemble come as TorchRL can train them.
+def count_members(name: str, members: Any, number: str, count: int | None) -> int:
+    """How many members an ensemble has: ``count``, by default two, or as many as a list holds.
 
     Raises:
-        ValueError: they are a list of one, of which TorchRL makes parameters that no optimizer sees.
+        ValueError: ``count`` is below one or not the length of the list; or they are a list of one, of
+            which TorchRL makes parameters that no optimizer sees.
     """
-    if isinstance(members, list) and len(members) == 1:
+    if not isinstance(members, list):
+        count = 2 if count is None else count
+        if count < 1:
+            raise ValueError(f"{number} must be >= 1, got {count}.")
+        return count
+    if len(members) == 1:
         raise ValueError(f"{name} must be a critic or a list of several, got a list of one.")
+    if count not in (None, len(members)):
+        raise ValueError(
+            f"{number} must be {len(members)}, as {name} is a list of so many, got {count}."
+        )
+    return len(members)

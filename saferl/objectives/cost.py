@@ -16,7 +16,13 @@ from torchrl.objectives.utils import distance_loss
 
 from saferl.modules import BoundCritics, CriticEnsemble, LagrangeMultiplier, Largest
 from saferl.modules.critics import REDUCTIONS
-from saferl.objectives.checks import check_cost, check_gamma, check_lagrange, check_limit
+from saferl.objectives.checks import (
+    check_cost,
+    check_gamma,
+    check_lagrange,
+    check_limit,
+    count_members,
+)
 
 #: What the cost critics' target may be of its members' values.
 COST_TARGETS = ("max", "mean")
@@ -87,7 +93,7 @@ class CostCriticLoss(LossModule):
     def _add_cost_critic(
         self,
         cost_critic: TensorDictModule | list[TensorDictModule],
-        num_cost_critics: int,
+        num_cost_critics: int | None,
         *,
         lagrange: LagrangeMultiplier,
         cost_limit: float,
@@ -98,8 +104,9 @@ class CostCriticLoss(LossModule):
         compare_against: list[nn.Parameter] | None,
     ) -> None:
         cost_limit = check_limit(cost_limit)
-        if num_cost_critics < 1:
-            raise ValueError(f"num_cost_critics must be >= 1, got {num_cost_critics}.")
+        num_cost_critics = count_members(
+            "cost_critic", cost_critic, "num_cost_critics", num_cost_critics
+        )
         for name, value, choices in (
             ("cost_target", cost_target, COST_TARGETS),
             ("cost_backup", cost_backup, COST_BACKUPS),

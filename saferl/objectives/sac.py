@@ -17,7 +17,7 @@ from torchrl.objectives import SACLoss
 from torchrl.objectives.sac import compute_rsample_log_prob
 
 from saferl.modules import BoundCritics, LagrangeMultiplier
-from saferl.objectives.checks import check_members
+from saferl.objectives.checks import count_members
 from saferl.objectives.cost import CostCriticLoss
 
 _LOSSES = ("loss_actor", "loss_qvalue", "loss_cost", "loss_alpha")
@@ -72,8 +72,8 @@ class SACLagLoss(CostCriticLoss, SACLoss):
         risk (callable, optional): what :math:`Q_c(s, \tilde a)` is of the members' values ``[n, *B, K]``.
             Defaults to :class:`~saferl.modules.Largest` (paper).
         rescale (bool, optional): divide the actor's loss by :math:`1 + \lambda`. Defaults to ``False`` (paper).
-        num_qvalue_nets (int, optional): reward critics. Defaults to ``2``.
-        num_cost_critics (int, optional): cost critics. Defaults to ``2``.
+        num_qvalue_nets (int, optional): reward critics. Defaults to ``2``, or the length of a list.
+        num_cost_critics (int, optional): cost critics. Defaults to ``2``, or the length of a list.
         delay_qvalue (bool, optional): keep target copies of both kinds of
             critic. Defaults to ``True``.
         alpha_init, min_alpha, max_alpha, action_spec, fixed_alpha,
@@ -161,8 +161,8 @@ class SACLagLoss(CostCriticLoss, SACLoss):
         cost_backup: Literal["sum", "reach"] = "sum",
         risk: Callable[[Tensor], Tensor] | None = None,
         rescale: bool = False,
-        num_qvalue_nets: int = 2,
-        num_cost_critics: int = 2,
+        num_qvalue_nets: int | None = None,
+        num_cost_critics: int | None = None,
         alpha_init: float = 1.0,
         min_alpha: float | None = None,
         max_alpha: float | None = None,
@@ -176,10 +176,9 @@ class SACLagLoss(CostCriticLoss, SACLoss):
         use_prioritized_weights: Literal["auto"] | bool = "auto",
         scalar_output_mode: Literal["exclude", "non_tensor"] | None = None,
     ) -> None:
-        check_members("qvalue_network", qvalue_network)
-        check_members("cost_critic", cost_critic)
-        if num_qvalue_nets < 1:
-            raise ValueError(f"num_qvalue_nets must be >= 1, got {num_qvalue_nets}.")
+        num_qvalue_nets = count_members(
+            "qvalue_network", qvalue_network, "num_qvalue_nets", num_qvalue_nets
+        )
         super().__init__(
             actor_network,
             qvalue_network,

@@ -12,7 +12,7 @@ import math
 
 import pytest
 import torch
-from omnisafe import (
+from omnisafe_fixture import (
     ACTION_VALUE,
     FIXTURE,
     STATE_VALUE,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from omnisafe import (
+from omnisafe_fixture import (
     ACTION,
     FIXTURE,
     assert_agrees,

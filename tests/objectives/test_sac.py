@@ -323,6 +323,15 @@ def test_a_bad_gamma_is_named(make_loss, gamma):
     torch.testing.assert_close(loss.value_estimator.gamma, torch.tensor(0.9))
 
 
+def test_a_list_is_as_many_critics_as_it_holds(make_loss, make_critic):
+    reward = [make_critic("state_action_value") for _ in range(3)]
+    cost = [make_critic("state_action_cost_value") for _ in range(4)]
+    loss = make_loss(qvalue_network=reward, cost_critic=cost)
+    assert (loss.num_qvalue_nets, loss.num_cost_critics) == (3, 4)
+    with pytest.raises(ValueError, match="num_cost_critics must be 4, as cost_critic is a list"):
+        make_loss(cost_critic=cost, num_cost_critics=2)
+
+
 @pytest.mark.parametrize("name", ["num_qvalue_nets", "num_cost_critics"])
 def test_an_empty_ensemble_is_refused(make_loss, name):
     with pytest.raises(ValueError, match=f"{name} must be >= 1, got 0"):
