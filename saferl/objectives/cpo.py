@@ -22,6 +22,9 @@ from saferl.objectives.trust_region import (
     flat,
 )
 
+#: Weight of a batch's episodes against those of the next one, in the mean cost of an episode.
+_MEMORY = 0.8
+
 
 def policy_kl(old: Distribution, new: Distribution) -> Tensor:
     """KL(old || new) of two policies [*B], summed over the dimensions of an action.
@@ -50,8 +53,8 @@ class CPOLoss(CostValueLoss, PPOLoss):
     the policy, and :math:`c = (J_c - d) / w` the violation *per decision*: g and b are means over decisions,
     and :math:`J_c(\pi') - J_c(\pi)` is to first order :math:`w = E[\sum_{t<L} \gamma^t]` times such a mean, L the
     length of an episode. :math:`J_c = E[\sum_{t<L} \gamma^t c_t]` is the discounted cost of an episode from its
-    start to its end, by termination or truncation; both are means over the episodes that ended in the batch,
-    which may have begun in earlier ones.
+    start to its end, by termination or truncation; both are means over the episodes that ended lately
+    (:meth:`cost_of_policy`).
 
     The step is shortened by ``backtrack`` until the KL is within delta, the surrogate does not get worse, and
     the cost's surrogate does not rise above its limit (above where it was, from an infeasible start); if none
@@ -119,7 +122,7 @@ class CPOLoss(CostValueLoss, PPOLoss):
 
     cost_limit: Tensor
     report: Tensor
-    episode: Tensor
+    ended: Tensor
 
     def __init__(
         self,
@@ -164,10 +167,8 @@ class CPOLoss(CostValueLoss, PPOLoss):
         self.search_steps, self.backtrack = search_steps, backtrack
         # Of the last step: KL, J_c, fraction of the step, number of the case.
         self.register_buffer("report", torch.full((4,), torch.nan, device=device))
-        # Means over the episodes that ended last: discounted cost, and discounted number of decisions.
-        self.register_buffer(
-            "episode", torch.full((2,), torch.nan, dtype=torch.float64, device=device)
-        )
+        # Of the episodes that ended lately: discounted costs, discounted decisions and their number.
+        self.register_buffer("ended", torch.zeros(3, dtype=torch.float64, device=device))
         # Both so far in each episode that goes on, the next step's discount, and whether its start was seen.
         self.running = torch.zeros(0, 4, dtype=torch.float64)
 
@@ -198,10 +199,10 @@ class CPOLoss(CostValueLoss, PPOLoss):
     def cost_of_policy(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         r"""The discounted cost of an episode of the policy that collected a batch, and its decisions.
 
-        Means of :math:`\sum_{t<L} \gamma^t c_t` and :math:`\sum_{t<L} \gamma^t` over the episodes that end in the
-        batch and whose start was seen, in this batch or in an earlier one: each call takes its batch as the
-        continuation of the one before, where the shapes are equal. Where none ends, the last such means; before
-        the first end, what the running episodes have cost so far and V_c of the rest.
+        Means of :math:`\sum_{t<L} \gamma^t c_t` and :math:`\sum_{t<L} \gamma^t` over the episodes that ended and whose
+        start was seen; those of each batch weigh 0.8 of those of the next one in which any ends, as the few of one batch
+        are a noisy mean. Each call takes its batch as the continuation of the one before, where the shapes are
+        equal. Before the first end, what the running episodes have cost so far and V_c of the rest.
 
         Args:
             tensordict: ``[*B, T]`` as :meth:`CostValueLoss.begin` leaves it; ``"is_init"`` (of TorchRL's
@@ -213,10 +214,10 @@ class CPOLoss(CostValueLoss, PPOLoss):
         following, keys = tensordict.get("next"), self.tensor_keys
         cost, done = (following.get(key).squeeze(-1) for key in (keys.cost, keys.done))
         first = tensordict.get(keys.is_init).squeeze(-1)
-        gamma = self._cost_value_estimator.gamma.to(self.episode)
-        running = self.running.to(self.episode.device)
+        gamma = self._cost_value_estimator.gamma.to(self.ended)
+        running = self.running.to(self.ended.device)
         if running.shape[:-1] != cost.shape[:-1]:
-            running = self.episode.new_tensor([0.0, 0.0, 1.0, 0.0]).expand(*cost.shape[:-1], 4)
+            running = self.ended.new_tensor([0.0, 0.0, 1.0, 0.0]).expand(*cost.shape[:-1], 4)
         fresh = running.new_tensor([0.0, 0.0, 1.0, 1.0])
         steps = []
         for now, start in zip(cost.unbind(-1), first.unbind(-1), strict=True):
@@ -226,16 +227,17 @@ class CPOLoss(CostValueLoss, PPOLoss):
             steps.append(running)
         self.running = running
         after = torch.stack(steps, -2)
-        ended = after[done & (after[..., 3] > 0)]
+        ended = after[done & (after[..., 3] > 0)]  # the last column is 1: it counts them
         if len(ended):
-            self.episode.copy_(ended[:, :2].mean(0))
-        elif self.episode.isnan().any():
-            with self.cost_critic_params.to_module(self.cost_critic, preserve_module_state=False):
-                last = following[..., -1].select(*self.cost_critic.in_keys)
-                ahead = self.cost_critic(last).get(keys.state_cost_value).squeeze(-1)
-            rest = torch.where(done[..., -1], 0.0, running[..., 2] * ahead)
-            return (running[..., 0] + rest).mean().to(cost), running[..., 1].mean().to(cost)
-        return self.episode[0].to(cost), self.episode[1].to(cost)
+            self.ended.mul_(_MEMORY).add_(ended[:, [0, 1, 3]].sum(0))
+        if self.ended[2] > 0:
+            cost_of_one, weight_of_one = self.ended[:2] / self.ended[2]
+            return cost_of_one.to(cost), weight_of_one.to(cost)
+        with self.cost_critic_params.to_module(self.cost_critic, preserve_module_state=False):
+            last = following[..., -1].select(*self.cost_critic.in_keys)
+            ahead = self.cost_critic(last).get(keys.state_cost_value).squeeze(-1)
+        rest = torch.where(done[..., -1], 0.0, running[..., 2] * ahead)
+        return (running[..., 0] + rest).mean().to(cost), running[..., 1].mean().to(cost)
 
     def _surrogates(
         self, batch: TensorDictBase, old: Distribution
