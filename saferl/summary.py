@@ -90,7 +90,7 @@ def side_by_side(runs: Sequence[tuple[Mapping, Mapping]]) -> str:
         groups.setdefault(name, []).append(figures)
     columns = [name for name in COLUMNS if any(name in figures for _, figures in runs)]
     titles = [FIGURES[name][0] + " %" * name.endswith("_rate") for name in columns]
-    rows = [["", "seeds", *titles]]
+    rows = [["", "runs", *titles]]
     for name, tests in groups.items():
         row = [name, str(len(tests))]
         for column in columns:

@@ -259,7 +259,7 @@ def test_train_from_any_folder_then_multirun(command, tmp_path: Path, capsys):
     assert capsys.readouterr().out.splitlines() == summary
     with pytest.raises(SystemExit, match="no run below elsewhere has been tested"):
         summarise(["elsewhere"])
-    assert summary[0].split() == ["seeds", "SR", "%", "CR", "%", "return", "cost", "return"]
+    assert summary[0].split() == ["runs", "SR", "%", "CR", "%", "return", "cost", "return"]
     for line, algo in zip(summary[1:], ("sac", "asac"), strict=True):
         assert re.match(algo + r" gs +2 +\S+ \[\S+, \S+\]  ", line)
 
