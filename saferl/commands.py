@@ -37,11 +37,11 @@ DRIVERS = {"random": RandomDriver, "blind": Driver, "scripted": CautiousDriver}
 
 def train(cfg: DictConfig) -> None:
     """Train, or continue a run, then test the result."""
-    if cfg.resume is None:
+    resuming = cfg.resume is not None
+    if not resuming:
         run = Path(HydraConfig.get().runtime.output_dir)
         complete(cfg)
         OmegaConf.resolve(cfg)
-        trainer = build_trainer(cfg, run)
         claim(run, cfg)
     else:
         others = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]
@@ -52,13 +52,14 @@ def train(cfg: DictConfig) -> None:
             )
         run = run_folder(Path(str(cfg.resume)), "resume")
         cfg = run_config(run)
-        trainer = build_trainer(cfg, run)
-        trainer.resume()
-    log.info("%s on %s, seed %d. Files: %s", cfg.algo_name, cfg.task.task, cfg.seed, run)
     try:
+        trainer = build_trainer(cfg, run)
+        if resuming:
+            trainer.resume()
+        log.info("%s on %s, seed %d. Files: %s", cfg.algo_name, cfg.task.task, cfg.seed, run)
         trainer.train()
     finally:
-        if not (run / checkpoint.FOLDER).exists():  # it never began
+        if not resuming and not (run / checkpoint.FOLDER).exists():  # it never began
             (run / CONFIG).unlink(missing_ok=True)
 
     settings = cfg.evaluation
