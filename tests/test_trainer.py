@@ -19,7 +19,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.envs import RewardSum, TransformedEnv
 
-from saferl import commands
+from saferl import builders, commands
 from saferl.builders import STORED, build_trainer
 from saferl.checkpoint import CONFIG
 from saferl.envs.intersection import BatchedIntersection, Scenario
@@ -339,12 +339,11 @@ def test_trainer_refuses(name: str, value: int, tmp_path: Path):
 
 
 def test_two_runs_that_start_at_once_do_not_share_a_folder(refusal, monkeypatch, tmp_path: Path):
-    def build(cfg, run):
-        trainer = build_trainer(cfg, run)
-        commands.claim(run, OmegaConf.create({"seed": 7}))  # the other run, faster by a moment
-        return trainer
+    def complete(cfg):
+        builders.complete(cfg)
+        commands.claim(tmp_path / "run", OmegaConf.create({"seed": 7}))  # faster by a moment
 
-    monkeypatch.setattr(commands, "build_trainer", build)
+    monkeypatch.setattr(commands, "complete", complete)
     line = refusal("train", "config", *SMALL, *EMPTY, "algo=sac", "out=run")
     assert "run holds a run already; continue it with resume=" in line
     assert [path.name for path in (tmp_path / "run").iterdir()] == [CONFIG]

@@ -86,9 +86,10 @@ def test_compiled_in_parts(monkeypatch, request, backend, batch):
     states["action"] = torch.rand(batch, 2) * 2 - 1
     limit = ensemble(states.copy())["risk"].mean().item() - (batch == 1)
     forms = [SafetyProjector(ensemble, limit, penalty=10.0, compile=c) for c in (False, True)]
+    envs = [TransformedEnv(EchoEnv(), form) for form in forms]
     plain, compiled = (form._inv_call(states.copy())["_safety_projection"] for form in forms)
     changed = int(plain["intervened"].sum())
     assert changed == 1 if batch == 1 else batch / 4 < changed < batch
     for key, value in plain.items():
         torch.testing.assert_close(compiled[key], value, rtol=0, atol=1e-5)
-    assert [len(form.latencies) for form in forms] == [1, 1]
+    assert [len(env.transform.latencies) for env in envs] == [1, 1]
