@@ -4,8 +4,8 @@
         [--set KEY=VALUE ...] [--seeds 0 1] [--tasks lt gs rt] [--episodes 500] [--jobs 2] [--json PATH]
 
 Trains every composition with every seed on ``task=mixed``, ``--jobs`` at once with one thread each, and tests it
-on each task, the same episodes for all. ``{seed}`` in a setting is the seed: ``init=runs/asac_{seed}``. A run that is there already is continued, or left as it is, so that the
-script can be stopped and started again. Prints one line for each composition and task: the rates of every
+on each task, the same episodes for all. ``{seed}`` in a setting is the seed: ``init=runs/asac_{seed}``.
+A run that is there already is continued, or left as it is, so that the script can be stopped and started again. Prints one line for each composition and task: the rates of every
 seed, and of all seeds' episodes together with Wilson's 95% interval. The seeds differ by more than such
 an interval says.
 """
