@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -118,7 +119,6 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
 
-    width = options.width
     trials = {
         "cautious driver's action": ("keys", ("attended", "embedded"), "expert"),
         "reward that follows": ("branch", ("vehicle", "scene"), "reward"),
@@ -136,11 +136,9 @@ def main() -> None:
         held_out = ENVS // 5
         parts = data[held_out:][data["seen"][held_out:]], data[:held_out][data["seen"][:held_out]]
         for name, (_, forms, label) in trials.items():
+            network = Policy if label == "expert" else Value
             for form in forms:
-                if label == "expert":
-                    build = lambda form=form: Policy(width, form)  # noqa: E731
-                else:
-                    build = lambda form=form: Value(width, form)  # noqa: E731
+                build = partial(network, options.width, form)
                 errors[name][form].append(error(build, *parts, label, options, seed))
         print(f"seed {seed}: {len(parts[0])} transitions, {len(parts[1])} held out", flush=True)
 
