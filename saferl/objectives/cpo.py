@@ -14,6 +14,7 @@ from torchrl.objectives import PPOLoss
 
 from saferl.objectives.advantages import CostValueLoss
 from saferl.objectives.checks import check_begun, check_limit
+from saferl.objectives.episodes import EpisodeCost
 from saferl.objectives.ppo import CostKeys
 from saferl.objectives.trust_region import (
     CASES,
@@ -21,9 +22,6 @@ from saferl.objectives.trust_region import (
     constrained_direction,
     flat,
 )
-
-#: Weight of a batch's episodes against those of the next one, in the mean cost of an episode.
-_MEMORY = 0.8
 
 
 def policy_kl(old: Distribution, new: Distribution) -> Tensor:
@@ -122,7 +120,6 @@ class CPOLoss(CostValueLoss, PPOLoss):
 
     cost_limit: Tensor
     report: Tensor
-    ended: Tensor
 
     def __init__(
         self,
@@ -167,16 +164,7 @@ class CPOLoss(CostValueLoss, PPOLoss):
         self.search_steps, self.backtrack = search_steps, backtrack
         # Of the last step: KL, J_c, fraction of the step, number of the case.
         self.register_buffer("report", torch.full((4,), torch.nan, device=device))
-        # Of the episodes that ended lately: discounted costs, discounted decisions and their number.
-        self.register_buffer("ended", torch.zeros(3, dtype=torch.float64, device=device))
-        # Both so far in each episode that goes on, the next step's discount, and whether its start was seen.
-        self.running = torch.zeros(0, 4, dtype=torch.float64)
-
-    def get_extra_state(self) -> dict[str, Tensor]:
-        return {"running": self.running}
-
-    def set_extra_state(self, state: dict[str, Tensor]) -> None:
-        self.running = state["running"]
+        self.episodes = EpisodeCost().to(device)
 
     @torch.no_grad()
     def begin(self, tensordict: TensorDictBase) -> None:
@@ -197,47 +185,31 @@ class CPOLoss(CostValueLoss, PPOLoss):
 
     @torch.no_grad()
     def cost_of_policy(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        r"""The discounted cost of an episode of the policy that collected a batch, and its decisions.
+        """The discounted cost of an episode of the policy that collected a batch, and its decisions.
 
-        Means of :math:`\sum_{t<L} \gamma^t c_t` and :math:`\sum_{t<L} \gamma^t` over the episodes that ended and whose
-        start was seen; those of each batch weigh 0.8 of those of the next one in which any ends, as the few of one batch
-        are a noisy mean. Each call takes its batch as the continuation of the one before, where the shapes are
-        equal. Before the first end, what the running episodes have cost so far and V_c of the rest.
+        Means over the episodes that ended lately (:class:`~saferl.objectives.episodes.EpisodeCost`); before
+        the first end, what the running episodes have cost so far and V_c of the rest.
 
         Args:
             tensordict: ``[*B, T]`` as :meth:`CostValueLoss.begin` leaves it; ``"is_init"`` (of TorchRL's
                 ``InitTracker``) tells where episodes begin.
 
         Returns:
-            Two scalars, J_c in the unit of the cost.
+            Two scalars, J_c in the unit of the cost and a discounted number of decisions.
         """
         following, keys = tensordict.get("next"), self.tensor_keys
         cost, done = (following.get(key).squeeze(-1) for key in (keys.cost, keys.done))
         first = tensordict.get(keys.is_init).squeeze(-1)
-        gamma = self._cost_value_estimator.gamma.to(self.ended)
-        running = self.running.to(self.ended.device)
-        if running.shape[:-1] != cost.shape[:-1]:
-            running = self.ended.new_tensor([0.0, 0.0, 1.0, 0.0]).expand(*cost.shape[:-1], 4)
-        fresh = running.new_tensor([0.0, 0.0, 1.0, 1.0])
-        steps = []
-        for now, start in zip(cost.unbind(-1), first.unbind(-1), strict=True):
-            total, weight, discount, seen = torch.where(start[..., None], fresh, running).unbind(-1)
-            parts = (total + discount * now, weight + discount, discount * gamma, seen)
-            running = torch.stack(parts, -1)
-            steps.append(running)
-        self.running = running
-        after = torch.stack(steps, -2)
-        ended = after[done & (after[..., 3] > 0)]  # the last column is 1: it counts them
-        if len(ended):
-            self.ended.mul_(_MEMORY).add_(ended[:, [0, 1, 3]].sum(0))
-        if self.ended[2] > 0:
-            cost_of_one, weight_of_one = self.ended[:2] / self.ended[2]
-            return cost_of_one.to(cost), weight_of_one.to(cost)
+        self.episodes.update(cost, first, done, self._cost_value_estimator.gamma)
+        if self.episodes.count > 0:
+            of_one, weight = self.episodes.mean
+            return of_one.to(cost), weight.to(cost)
         with self.cost_critic_params.to_module(self.cost_critic, preserve_module_state=False):
             last = following[..., -1].select(*self.cost_critic.in_keys)
             ahead = self.cost_critic(last).get(keys.state_cost_value).squeeze(-1)
-        rest = torch.where(done[..., -1], 0.0, running[..., 2] * ahead)
-        return (running[..., 0] + rest).mean().to(cost), running[..., 1].mean().to(cost)
+        so_far, weight, discount, _ = self.episodes.running.unbind(-1)
+        rest = torch.where(done[..., -1], 0.0, discount * ahead)
+        return (so_far + rest).mean().to(cost), weight.mean().to(cost)
 
     def _surrogates(
         self, batch: TensorDictBase, old: Distribution
