@@ -1,13 +1,14 @@
 """Compositions side by side: how often each arrives and crashes on each task, over seeds.
 
     python benchmarks/ablation.py OUT --runs "algo=arsac" "algo=arsac cost_critic=quantile risk=cvar" ...
-        [--set KEY=VALUE ...] [--seeds 0 1] [--tasks lt gs rt] [--episodes 500] [--jobs 2] [--json PATH]
+        [--set KEY=VALUE ...] [--seeds 0 1] [--train mixed] [--tasks lt gs rt] [--episodes 500] [--jobs 2]
+        [--json PATH]
 
-Trains every composition with every seed on ``task=mixed``, ``--jobs`` at once with one thread each, and tests it
-on each task, the same episodes for all. ``{seed}`` in a setting is the seed: ``init=runs/asac_{seed}``.
-A run that is there already is continued, or left as it is, so that the script can be stopped and started again. Prints one line for each composition and task: the rates of every
-seed, and of all seeds' episodes together with Wilson's 95% interval. The seeds differ by more than such
-an interval says.
+Trains every composition with every seed on one task, ``--jobs`` at once with one thread each, and tests it
+on each of ``--tasks``, the same episodes for all. ``{seed}`` in a setting is the seed: ``init=runs/asac_{seed}``.
+A run that is there already is continued, or left as it is, so that the script can be stopped and started again.
+Prints one line for each composition and task: the rates of every seed, and of all seeds' episodes together with
+Wilson's 95% interval. The seeds differ by more than such an interval says.
 """
 
 from __future__ import annotations
@@ -47,8 +48,8 @@ def train_and_test(run: Path, overrides: list[str], options: argparse.Namespace)
     run.parent.mkdir(parents=True, exist_ok=True)
     log = run.with_suffix(".log")
     if not (run / "checkpoints").exists():
-        fixed = ["task=mixed", "threads=1", "logger=none", "evaluation.episodes=1", f"out={run}"]
-        saferl("saferl", *overrides, *fixed, log=log)
+        fixed = [f"task={options.train}", "threads=1", "logger=none", "evaluation.episodes=1"]
+        saferl("saferl", *overrides, *fixed, f"out={run}", log=log)
     elif not (run / "evaluation" / "metrics.json").exists():
         saferl("saferl", f"resume={run}", log=log)
     for task in options.tasks:
@@ -67,6 +68,7 @@ def main() -> None:
     parser.add_argument("--runs", nargs="+", required=True, metavar="COMPOSITION")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="of all runs")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1])
+    parser.add_argument("--train", default="mixed", metavar="TASK", help="the task of training")
     parser.add_argument("--tasks", nargs="+", default=["lt", "gs", "rt"])
     parser.add_argument("--episodes", type=int, default=500)
     parser.add_argument("--jobs", type=int, default=2, help="runs at once")
