@@ -55,7 +55,7 @@ def train_and_test(run: Path, overrides: list[str], options: argparse.Namespace)
     for task in options.tasks:
         test = run / f"test_{task}"
         if not (test / "metrics.json").exists():
-            how = [f"episodes={options.episodes}", "env.num_envs=250"]
+            how = [f"episodes={options.episodes}", f"env.num_envs={min(options.episodes, 500)}"]
             where = [f"checkpoint={run}", f"task={task}", "env=batched", f"out={test}"]
             saferl("saferl.evaluate", *where, *how, log=log)
 
