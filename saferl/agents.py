@@ -142,8 +142,8 @@ def build_agent(cfg: DictConfig) -> Agent:
 
     def action_values(critics: DictConfig) -> list[torch.nn.Module]:
         # Only what differs, so that an encoder need not know of options that it is not asked for.
-        asked = {"outputs": critics.get("outputs", 1), "layer_norm": critics.get("layer_norm")}
-        options = {key: value for key, value in asked.items() if value not in (1, False, None)}
+        usual = {"outputs": 1, "layer_norm": False}
+        options = {key: critics[key] for key in usual if critics.get(key, usual[key]) != usual[key]}
         return [
             hydra.utils.instantiate(cfg.encoder.value, **options).to(device)
             for _ in range(critics.members)
