@@ -22,7 +22,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from side_by_side import write
+from side_by_side import belongs, write
 
 from saferl.metrics import wilson
 
@@ -75,6 +75,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the figures here")
     options = parser.parse_args()
 
+    belongs(options.out, {"train": options.train, "set": options.set})
     folders = {
         (name, seed): options.out / re.sub(r"[^\w.]+", "_", name) / f"seed{seed}"
         for seed in options.seeds

@@ -65,6 +65,14 @@ def conditions(options: argparse.Namespace) -> str:
     )
 
 
+def belongs(out: Path, settings: dict[str, Any]) -> None:
+    """Refuse a folder whose runs were made with other settings: they would be read as these."""
+    settings, file = json.loads(json.dumps(settings)), out / "settings.json"
+    if file.exists() and (theirs := json.loads(file.read_text())) != settings:
+        raise SystemExit(f"{out} holds runs of {theirs}, not of {settings}: take another folder.")
+    write(file, settings)
+
+
 def write(path: Path | None, figures: dict[str, Any]) -> None:
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)

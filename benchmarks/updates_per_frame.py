@@ -5,8 +5,8 @@
         [--json PATH]
 
 Trains from nothing, one run after the other in OUT, each with as many frames as fit in the minutes: the
-first run of a value is preceded by a short one that measures its frames a second. What is in OUT already is
-not run again. Prints for each run the minutes that it took, frames, updates, and the closing test's success
+first run of a value is preceded by a short one that measures its frames a second. Nothing is compiled, which
+would take a share of the minutes that has nothing to do with the value. What is in OUT already is not run again. Prints for each run the minutes that it took, frames, updates, and the closing test's success
 rate with its 95% interval, and draws the success rate of the training episodes against the minutes.
 """
 
@@ -19,7 +19,7 @@ import sys
 from pathlib import Path
 
 from matplotlib import pyplot as plt
-from side_by_side import write
+from side_by_side import belongs, write
 
 from saferl.metrics import CsvLog
 
@@ -45,7 +45,7 @@ def train(out: Path, frames: int, overrides: list[str]) -> None:
 
 
 def frames_in(run: Path, minutes: float) -> int:
-    """How many frames fit, by the last half of a short run; its first updates compile."""
+    """How many frames fit, by the last half of a short run."""
     timing = CsvLog(run / "timing.csv").read()
     first, last = timing[len(timing) // 2], timing[-1]
     speed = (last["frames"] - first["frames"]) / (seconds(last) - seconds(first))
@@ -67,13 +67,16 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the figures here")
     options = parser.parse_args()
 
+    same = {key: getattr(options, key) for key in ("algo", "task", "minutes", "set")}
+    belongs(options.out, same)
     figures: dict = {}
     axes = plt.figure(figsize=(6, 4)).gca()
     print(
         f"{'updates/frame':>14s}{'seed':>6s}{'minutes':>9s}{'frames':>10s}{'updates':>9s}  success"
     )
     for number, value in enumerate(options.values):
-        common = [f"algo={options.algo}", f"task={options.task}"]
+        # By default the long runs alone would compile, which the short one says nothing about.
+        common = [f"algo={options.algo}", f"task={options.task}", "compile=false"]
         common += [f"updates_per_frame={value}", *options.set]
         trial = options.out / f"trial_{value}"
         train(trial, WARMUP + int(UPDATES / value), [*common, "evaluation.episodes=1"])

@@ -26,6 +26,9 @@ from saferl.modules import (
     zero_output,
 )
 
+#: A critic's options, and what they are where nothing is said.
+USUAL = {"outputs": 1, "layer_norm": False}
+
 
 def device_of(cfg: DictConfig) -> torch.device:
     """The configured device; ``auto`` is a GPU where there is one.
@@ -120,8 +123,8 @@ def _check_parts(cfg: DictConfig) -> None:
             raise ValueError(
                 f"{loss} has one state value: set {name}=single, got {cfg[name].members} members."
             )
-        for key, plain in (("outputs", 1), ("layer_norm", False)):
-            if cfg[name].get(key, plain) != plain:
+        for key, usual in USUAL.items():
+            if cfg[name].get(key, usual) != usual:
                 raise ValueError(
                     f"{name}.{key} is of action values, which {loss} has not, got {cfg[name][key]}."
                 )
@@ -142,8 +145,8 @@ def build_agent(cfg: DictConfig) -> Agent:
 
     def action_values(critics: DictConfig) -> list[torch.nn.Module]:
         # Only what differs, so that an encoder need not know of options that it is not asked for.
-        usual = {"outputs": 1, "layer_norm": False}
-        options = {key: critics[key] for key in usual if critics.get(key, usual[key]) != usual[key]}
+        asked = {key: critics.get(key) for key in USUAL}
+        options = {k: v for k, v in asked.items() if v is not None and v != USUAL[k]}
         return [
             hydra.utils.instantiate(cfg.encoder.value, **options).to(device)
             for _ in range(critics.members)
@@ -217,11 +220,17 @@ def load_agent(cfg: DictConfig, path: Path, name: str) -> Agent:
 
 def _architecture(cfg: DictConfig) -> dict[str, Any]:
     """What decides whether the networks of two configurations fit, by option."""
-    encoder = {f"encoder.policy.{key}": value for key, value in cfg.encoder.policy.items()}
-    for follows in ("rows", "size"):  # the task
-        encoder.pop(f"encoder.policy.{follows}", None)
-    task = {f"task.{key}": cfg.task.get(key) for key in ("rows", "size", "action_dim")}
-    return {"algo_name": cfg.algo_name, **task, **encoder}
+    options = {f"task.{key}": cfg.task.get(key) for key in ("rows", "size", "action_dim")}
+    networks = ("policy",) if on_policy(cfg) else ("policy", "value")
+    for network in networks:
+        for key, value in cfg.encoder[network].items():
+            if key not in ("rows", "size"):  # the task
+                options[f"encoder.{network}.{key}"] = value
+    for name in ("critic", "cost_critic"):
+        if "value" in networks and cfg[name].members > 0:
+            options[f"{name}.members"] = cfg[name].members
+            options |= {f"{name}.{key}": cfg[name].get(key, usual) for key, usual in USUAL.items()}
+    return options
 
 
 def begin_from(agent: Agent, cfg: DictConfig, path: Path) -> None:
@@ -238,7 +247,7 @@ def begin_from(agent: Agent, cfg: DictConfig, path: Path) -> None:
         if key in theirs and theirs[key] != value
     }
     error = f"init: the networks of {path} do not fit: {', '.join(differing.values())}."
-    if any(key.startswith("encoder.") for key in differing):  # an activation has no shape
+    if any(not key.startswith("task.") for key in differing):  # an activation has no shape
         raise ValueError(error)
     try:
         load_component(found, Networks(agent.loss))

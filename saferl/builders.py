@@ -20,6 +20,7 @@ from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import LossModule, SoftUpdate
 
 from saferl.agents import Agent, begin_from, build_agent, device_of, make, observed, on_policy
+from saferl.checkpoint import FOLDER
 from saferl.envs.intersection import Scenario
 from saferl.envs.intersection.drivers import CautiousDriver, Driver
 from saferl.envs.transforms import ExecutedAction
@@ -235,7 +236,7 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
     torch.manual_seed(cfg.seed)
     scenario = hydra.utils.instantiate(cfg.task)
     agent = build_agent(cfg)
-    if cfg.init:
+    if cfg.init and not (run / FOLDER).exists():  # a run that goes on has its own networks
         begin_from(agent, cfg, Path(cfg.init))
 
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])

@@ -94,9 +94,10 @@ def claim(run: Path, cfg: DictConfig) -> None:
         with (run / CONFIG).open("x") as file:
             OmegaConf.save(cfg, file)
     except FileExistsError:
-        raise ValueError(
-            f"out: {run} holds a run already; continue it with resume={run}, or take another folder."
-        ) from None
+        way = f"continue it with resume={run}, or take another folder."
+        if not (run / checkpoint.FOLDER).exists():
+            way = "it has just begun, or was killed before its first checkpoint and can be deleted."
+        raise ValueError(f"out: {run} holds a run already; {way}") from None
 
 
 def evaluate(cfg: DictConfig) -> None:

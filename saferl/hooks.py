@@ -58,8 +58,13 @@ class EpisodeSignal:
         self.cost_limit = cost_limit
 
     def register(self, trainer: Trainer) -> None:
-        trainer.after_collect.append(self._update)
         self._lagrange = _multiplier(trainer)
+        if getattr(trainer.learner.loss, "cost_backup", "sum") != "sum":
+            raise ValueError(
+                "lagrange.signal=EpisodeSignal limits the summed cost of an episode, which cost_backup=reach does "
+                "not learn: set cost_backup=sum, or lagrange=statewise."
+            )
+        trainer.after_collect.append(self._update)
 
     def _update(self, finished: TensorDictBase, spent: float) -> None:
         if len(finished):

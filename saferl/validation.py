@@ -51,11 +51,14 @@ TRAINING = {
     "collector.frames_per_env": (int, 1, math.inf),
     "encoder.policy.width": (int, 1, math.inf),
     "critic.members": (int, 1, math.inf),
+    "critic.layer_norm": (bool | None, 0, 1),
     "cost_critic.members": (int, 0, math.inf),
+    "cost_critic.outputs": (int | None, 1, math.inf),
+    "cost_critic.layer_norm": (bool | None, 0, 1),
     "init": (str | None, 0, 0),
     "algo_name": (str, 0, 0),
 }
-POSITIVE = ("reward_scale", "tau", "alpha_init", "save_minutes")
+POSITIVE = ("updates_per_frame", "reward_scale", "tau", "alpha_init", "save_minutes")
 TESTING = {
     "episodes": (int, 1, math.inf),
     "seed": (int, 0, 2**31 - 1),
@@ -87,6 +90,11 @@ def check_training(cfg: DictConfig) -> None:
     for key in ("batch_size", "demonstrations"):
         if cfg.buffer_size < cfg[key]:
             raise ValueError(f"buffer_size must be >= {key}, got {cfg.buffer_size} and {cfg[key]}.")
+    collected = cfg.env.num_envs * cfg.collector.frames_per_env
+    if cfg.buffer_size < collected and cfg.experience._target_.endswith("Replay"):
+        raise ValueError(
+            f"buffer_size must be >= env.num_envs * collector.frames_per_env, got {cfg.buffer_size} and {collected}."
+        )
     check_targets(cfg)
 
 

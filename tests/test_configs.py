@@ -6,6 +6,7 @@ from pathlib import Path
 
 import hydra
 import pytest
+import torch
 from omegaconf import OmegaConf
 from small import EMPTY, SMALL, compose
 
@@ -108,11 +109,28 @@ def test_option_builds_or_is_refused_with_the_reason(option: str, tmp_path: Path
         (("algo=sac", "cost_backup=reach"), "set cost_backup=sum, or loss=sac_lag"),
         (("algo=cpo", "+cost_critic.outputs=16"), "cost_critic.outputs is of action values"),
         (("algo=ppo", "+critic.layer_norm=true"), "critic.layer_norm is of action values"),
+        (("algo=sac_lag", "cost_backup=reach"), "EpisodeSignal limits the summed cost"),
     ],
 )
 def test_an_option_that_nothing_would_read_is_refused(options, message: str, tmp_path: Path):
     with pytest.raises(ValueError, match=message):
         build_trainer(compose(*SMALL, *EMPTY, *options), tmp_path)
+
+
+@pytest.mark.parametrize("encoder", ["mmam", "mlp"])
+def test_critics_are_built_as_their_options_say(encoder: str):
+    """Also where an option equals another's usual value, as True does 1."""
+
+    def critics(*options: str):
+        loss = build_agent(compose(*SMALL, "algo=arsac", f"encoder={encoder}", *options)).loss
+        return loss.qvalue_network.module, loss.cost_critic_network.module
+
+    assert not any(critic.layer_norm for critic in critics())
+    for option in ("critic.layer_norm=true", "cost_critic.layer_norm=true"):
+        assert sum(critic.layer_norm for critic in critics(option)) == 1
+    plain, quantiles = critics("cost_critic=quantile")
+    scene = torch.zeros(3, 9), torch.zeros(3, 10, 6), torch.zeros(3, 2)
+    assert plain(*scene).shape == (3, 1) and quantiles(*scene).shape == (3, 16)
 
 
 @pytest.mark.parametrize("algo", ["sac_lag", "ppo_lag"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -13,6 +14,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensordict import TensorDict
 
 from saferl.builders import build_trainer
+from saferl.checkpoint import CONFIG
 from saferl.trainer import Trainer
 
 TRAFFIC = ("env=highway", "task.vehicles=3", "task=gs")
@@ -47,6 +49,19 @@ def restored(run: Path, *overrides: str) -> Trainer:
     trainer = build_trainer(compose(*overrides), run)
     trainer.resume()
     return trainer
+
+
+def test_resume_does_not_need_the_run_that_it_began_from(tmp_path: Path):
+    first, second = tmp_path / "first", tmp_path / "second"
+    options = (*SMALL, *EMPTY, "algo=sac")
+    first.mkdir()
+    OmegaConf.save(compose(*options), first / CONFIG, resolve=True)
+    build_trainer(compose(*options), first).train()
+    options = (*options, f"init={first}")
+    trained = build_trainer(compose(*options), second)
+    trained.train()
+    shutil.rmtree(first)
+    assert_same(everything(restored(second, *options)), everything(trained))
 
 
 @pytest.mark.parametrize("algo", ["sac", "arsac", "ppo_lag"])

@@ -57,6 +57,13 @@ MISTAKES = [
     ("task.duration=0.05", "duration must be at least a decision, 0.2 seconds, got 0.05."),
     ("task.vehicles=1 task.rows=1", "rows must be >= 2 with traffic, got 1: one row is always"),
     ("algo_name=foo/bar", "algo_name must be without / and \\, got 'foo/bar'."),
+    ("cost_critic.outputs=0", "cost_critic.outputs must be a whole number or null, >= 1, got 0."),
+    ("critic.layer_norm=1", "critic.layer_norm must be true or false or null, got 1."),
+    ("updates_per_frame=0", "updates_per_frame must be a number, > 0, got 0."),
+    (
+        "buffer_size=8 env.num_envs=9",
+        "buffer_size must be >= env.num_envs * collector.frames_per_env, got 8 and 9.",
+    ),
     ("algo_name=5", "algo_name must be text, got 5."),
     ("save_minutes=0", "save_minutes must be a number or null, > 0, got 0."),
 ]

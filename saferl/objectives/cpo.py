@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.distributions import Distribution, Independent, TransformedDistribution, kl_divergence
 from torchrl.objectives import PPOLoss
@@ -37,6 +38,16 @@ def policy_kl(old: Distribution, new: Distribution) -> Tensor:
     return kl_divergence(old, new)
 
 
+class CPOKeys(CostKeys):
+    """Keys that ``set_keys`` accepts beside those of PPOLagLoss.
+
+    Attributes:
+        is_init: whether a transition is an episode's first.
+    """
+
+    is_init: NestedKey = "is_init"
+
+
 class CPOLoss(CostValueLoss, PPOLoss):
     r"""A policy's trust-region step under a cost constraint, and the losses of its two value networks.
 
@@ -54,7 +65,8 @@ class CPOLoss(CostValueLoss, PPOLoss):
     start to its end, by termination or truncation; both are means over the episodes that ended lately
     (:meth:`cost_of_policy`).
 
-    The step is shortened by ``backtrack`` until the KL is within delta, the surrogate does not get worse, and
+    The step is shortened by ``backtrack`` until the KL is within delta, the surrogate does not get worse (which is
+    not asked where the step must first regain feasibility), and
     the cost's surrogate does not rise above its limit (above where it was, from an infeasible start); if none
     of ``search_steps`` will do, the policy stays where it was.
 
@@ -113,8 +125,8 @@ class CPOLoss(CostValueLoss, PPOLoss):
         True
     """
 
-    _AcceptedKeys = CostKeys
-    default_keys = CostKeys
+    _AcceptedKeys = CPOKeys
+    default_keys = CPOKeys
     _networks = ("critic_network", "cost_critic")
     _entries = ("value_target", "cost_value_target")
 
@@ -172,6 +184,9 @@ class CPOLoss(CostValueLoss, PPOLoss):
 
         Args:
             tensordict: ``[*B, T]``; gets what :meth:`CostValueLoss.begin` writes.
+
+        Raises:
+            KeyError: no cost, or no ``is_init``.
         """
         super().begin(tensordict)
         if tensordict.get(self.tensor_keys.is_init, None) is None:

@@ -23,14 +23,12 @@ class CostKeys(ClipPPOLoss._AcceptedKeys):
         cost: the cost under ``"next"``.
         state_cost_value: what the cost critic writes.
         cost_advantage, cost_value_target: written by ``begin``, read by the loss.
-        is_init: whether a transition is an episode's first.
     """
 
     cost: NestedKey = "cost"
     state_cost_value: NestedKey = "state_cost_value"
     cost_advantage: NestedKey = "cost_advantage"
     cost_value_target: NestedKey = "cost_value_target"
-    is_init: NestedKey = "is_init"
 
 
 class PPOLagLoss(CostValueLoss, ClipPPOLoss):

@@ -95,7 +95,9 @@ class SACLagLoss(CostCriticLoss, SACLoss):
 
     Raises:
         ValueError: ``cost_limit`` is negative or not finite, a number of critics is
-            below one, critics come as a list of one, or ``gamma`` lies outside [0, 1].
+            below one, critics come as a list of one, ``cost_target`` or ``cost_backup`` is
+            unknown, ``risk`` is no function, ``lagrange`` no multiplier, or ``gamma`` lies
+            outside [0, 1]; in a batch, ``cost_backup="reach"`` with multi-step transitions.
         KeyError: the batch holds no cost.
 
     Examples:

@@ -23,6 +23,7 @@ class CostToReward(Transform):
 
     Raises:
         KeyError: the environment has no ``in_key``.
+        ValueError: it is not one number for each environment.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
