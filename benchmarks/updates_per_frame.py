@@ -86,7 +86,7 @@ def main() -> None:
             train(run, frames, [*common, f"seed={seed}", *TEST])
             curve = CsvLog(run / "metrics.csv").read()
             minutes = [seconds(row) / 60 for row in CsvLog(run / "timing.csv").read()]
-            label = f"{value:g} updates a frame" if seed == options.seeds[0] else None
+            label = f"{value:.3g}" if seed == options.seeds[0] else None
             success = [100 * row["success_rate"] for row in curve]
             axes.plot(minutes, success, color=f"C{number}", label=label)
             test = json.loads((run / "evaluation" / "metrics.json").read_text())
@@ -99,7 +99,9 @@ def main() -> None:
             figures[f"{value}_{seed}"] = {"minutes": minutes, "success": success, "test": test}
     axes.set(xlabel="minutes of collecting and learning", ylabel="training episodes that arrive, %")
     axes.set_ylim(0, 100)
-    axes.legend()
+    axes.legend(
+        title="updates a frame", loc="lower center", bbox_to_anchor=(0.5, 1), ncols=9, frameon=False
+    )
     axes.grid(alpha=0.3)
     write(options.json, figures)
     if options.figure:
