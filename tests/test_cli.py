@@ -23,7 +23,7 @@ from saferl.trainer import _interrupts
 TRAIN, TEST, EXPORT = ("train", "config"), ("evaluate", "evaluate"), ("export", "export")
 
 MISTAKES = [
-    (TRAIN, "algo=foo", "algo must be one of arsac, arsac_signed, asac, cpo, ppo, "),
+    (TRAIN, "algo=foo", "algo must be one of arsac, arsac_plus, arsac_signed, asac, cpo, ppo, "),
     (TRAIN, "task=foo", "task must be one of cart, gs, gym, lt, mixed, rt, got 'foo'"),
     (TRAIN, "encoder=foo", "encoder must be one of mlp, mlp_tanh, mmam, got 'foo'"),
     (TRAIN, "env=foo", "env must be one of batched, cart, gym, highway, got 'foo'"),
@@ -300,7 +300,7 @@ def test_help_lists_groups_and_settings(command, capsys):
     assert not left.value.code
     text = capsys.readouterr().out
     assert "python -m saferl algo=arsac task=gs" in text
-    assert "algo: arsac, arsac_signed, asac, cpo, ppo" in text and "gamma: 0.99" in text
+    assert "algo: arsac, arsac_plus, arsac_signed, asac, cpo, ppo" in text and "gamma: 0.99" in text
 
 
 def test_the_readmes_everyday_commands_work_in_order(command, tmp_path: Path):

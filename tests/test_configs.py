@@ -12,7 +12,7 @@ from small import EMPTY, SMALL, compose
 
 from saferl.agents import build_agent
 from saferl.builders import build_trainer
-from saferl.modules import MLPPolicyEncoder, MMAMPolicyEncoder
+from saferl.modules import MeanStd, MLPPolicyEncoder, MMAMPolicyEncoder
 from saferl.paths import config_dir
 from saferl.validation import arguments, check_testing, check_training, fits
 
@@ -188,6 +188,13 @@ def test_composition_is_the_papers(algo: str):
     assert signal is None or cfg.lagrange.signal._target_.endswith(signal)
     assert (agent.projector is not None) == projector
     assert cfg.task.reward.get("risk_shaping", False) == shaping
+
+
+def test_arsac_plus_is_arsac_with_another_risk():
+    ours, papers = compose("algo=arsac_plus"), compose("algo=arsac")
+    differ = {key for key in papers if ours[key] != papers[key]}
+    assert differ == {"algo_name", "cost_critic", "risk", "loss"}  # loss.risk is risk
+    assert isinstance(build_agent(ours).loss.risk, MeanStd) and ours.cost_critic.members == 4
 
 
 @pytest.mark.parametrize(
