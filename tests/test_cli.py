@@ -49,7 +49,7 @@ MISTAKES = [
     (TRAIN, "seed=-1", "seed must be a whole number, >= 0 and <= 2147483647, got -1"),
     (TRAIN, "lr.actor=0.1", "lr.actor must be [first, last], both >= 0, got 0.1"),
     (TRAIN, "lr.actor=[1e-3,-1]", "lr.actor must be [first, last], both >= 0, got [0.001, -1]"),
-    (TRAIN, "updates_per_frame=-1", "updates_per_frame must be a number, >= 0, got -1"),
+    (TRAIN, "updates_per_frame=-1", "updates_per_frame must be a number, > 0, got -1"),
     (TRAIN, "buffer_size=10", "buffer_size must be >= batch_size, got 10 and 256"),
     (TRAIN, "alpha_init=0", "alpha_init must be a number, > 0, got 0"),
     (TRAIN, "evaluation.episodes=0", "evaluation.episodes must be a whole number, >= 1, got 0"),

@@ -123,13 +123,13 @@ def test_critics_are_built_as_their_options_say(encoder: str):
 
     def critics(*options: str):
         loss = build_agent(compose(*SMALL, "algo=arsac", f"encoder={encoder}", *options)).loss
-        return loss.qvalue_network.module, loss.cost_critic_network.module
+        return loss.qvalue_network.module, loss.cost_critic.module
 
     assert not any(critic.layer_norm for critic in critics())
     for option in ("critic.layer_norm=true", "cost_critic.layer_norm=true"):
         assert sum(critic.layer_norm for critic in critics(option)) == 1
     plain, quantiles = critics("cost_critic=quantile")
-    scene = torch.zeros(3, 9), torch.zeros(3, 10, 6), torch.zeros(3, 2)
+    scene = torch.zeros(3, 9), torch.zeros(3, 11, 6), torch.zeros(3, 2)
     assert plain(*scene).shape == (3, 1) and quantiles(*scene).shape == (3, 16)
 
 

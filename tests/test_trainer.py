@@ -345,7 +345,7 @@ def test_two_runs_that_start_at_once_do_not_share_a_folder(refusal, monkeypatch,
 
     monkeypatch.setattr(commands, "complete", complete)
     line = refusal("train", "config", *SMALL, *EMPTY, "algo=sac", "out=run")
-    assert "run holds a run already; continue it with resume=" in line
+    assert "run holds a run already; it has just begun, or was killed before" in line
     assert [path.name for path in (tmp_path / "run").iterdir()] == [CONFIG]
     assert "seed: 7\n" in (tmp_path / "run" / CONFIG).read_text()
 
