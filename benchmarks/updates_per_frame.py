@@ -6,8 +6,9 @@
 
 Trains from nothing, one run after the other in OUT, each with as many frames as fit in the minutes: the
 first run of a value is preceded by a short one that measures its frames a second. Nothing is compiled, which
-would take a share of the minutes that has nothing to do with the value. What is in OUT already is not run again. Prints for each run the minutes that it took, frames, updates, and the closing test's success
-rate with its 95% interval, and draws the success rate of the training episodes against the minutes.
+would take a share of the minutes that has nothing to do with the value. What is in OUT already is not run
+again. Prints for each run the minutes that it took, frames, updates, and the closing test's success rate with its
+95% interval, and draws the success rate of the training episodes against the minutes.
 """
 
 from __future__ import annotations
@@ -67,8 +68,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the figures here")
     options = parser.parse_args()
 
-    same = {key: getattr(options, key) for key in ("algo", "task", "minutes", "set")}
-    belongs(options.out, same)
+    belongs(options.out, {key: getattr(options, key) for key in ("algo", "task", "minutes", "set")})
     figures: dict = {}
     axes = plt.figure(figsize=(6, 4)).gca()
     print(

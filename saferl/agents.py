@@ -26,8 +26,13 @@ from saferl.modules import (
     zero_output,
 )
 
-#: A critic's options, and what they are where nothing is said.
+#: Options of a critic of action values, and what they are where nothing is said.
 USUAL = {"outputs": 1, "layer_norm": False}
+
+
+def _critic_options(critics: DictConfig) -> dict[str, Any]:
+    given = {key: critics.get(key) for key in USUAL}
+    return {key: USUAL[key] if value is None else value for key, value in given.items()}
 
 
 def device_of(cfg: DictConfig) -> torch.device:
@@ -123,10 +128,10 @@ def _check_parts(cfg: DictConfig) -> None:
             raise ValueError(
                 f"{loss} has one state value: set {name}=single, got {cfg[name].members} members."
             )
-        for key, usual in USUAL.items():
-            if cfg[name].get(key, usual) != usual:
+        for key, value in _critic_options(cfg[name]).items():
+            if value != USUAL[key]:
                 raise ValueError(
-                    f"{name}.{key} is of action values, which {loss} has not, got {cfg[name][key]}."
+                    f"{name}.{key} is of action values, which {loss} has not, got {value}."
                 )
 
 
@@ -145,8 +150,7 @@ def build_agent(cfg: DictConfig) -> Agent:
 
     def action_values(critics: DictConfig) -> list[torch.nn.Module]:
         # Only what differs, so that an encoder need not know of options that it is not asked for.
-        asked = {key: critics.get(key) for key in USUAL}
-        options = {k: v for k, v in asked.items() if v is not None and v != USUAL[k]}
+        options = {k: v for k, v in _critic_options(critics).items() if v != USUAL[k]}
         return [
             hydra.utils.instantiate(cfg.encoder.value, **options).to(device)
             for _ in range(critics.members)
@@ -221,15 +225,15 @@ def load_agent(cfg: DictConfig, path: Path, name: str) -> Agent:
 def _architecture(cfg: DictConfig) -> dict[str, Any]:
     """What decides whether the networks of two configurations fit, by option."""
     options = {f"task.{key}": cfg.task.get(key) for key in ("rows", "size", "action_dim")}
-    networks = ("policy",) if on_policy(cfg) else ("policy", "value")
-    for network in networks:
+    fresh = on_policy(cfg)
+    for network in ("policy",) if fresh else ("policy", "value"):
         for key, value in cfg.encoder[network].items():
             if key not in ("rows", "size"):  # the task
                 options[f"encoder.{network}.{key}"] = value
     for name in ("critic", "cost_critic"):
-        if "value" in networks and cfg[name].members > 0:
-            options[f"{name}.members"] = cfg[name].members
-            options |= {f"{name}.{key}": cfg[name].get(key, usual) for key, usual in USUAL.items()}
+        if not fresh and cfg[name].members > 0:
+            own = {"members": cfg[name].members, **_critic_options(cfg[name])}
+            options |= {f"{name}.{key}": value for key, value in own.items()}
     return options
 
 

@@ -65,10 +65,9 @@ class CPOLoss(CostValueLoss, PPOLoss):
     start to its end, by termination or truncation; both are means over the episodes that ended lately
     (:meth:`cost_of_policy`).
 
-    The step is shortened by ``backtrack`` until the KL is within delta, the surrogate does not get worse (which is
-    not asked where the step must first regain feasibility), and
-    the cost's surrogate does not rise above its limit (above where it was, from an infeasible start); if none
-    of ``search_steps`` will do, the policy stays where it was.
+    The step is shortened by ``backtrack`` until the KL is within delta, the surrogate does not get worse (not
+    asked where the step must first regain feasibility), and the cost's surrogate does not rise above its limit
+    (above where it was, from an infeasible start); if none of ``search_steps`` will do, the policy stays where it was.
 
     :meth:`forward` gives the losses of the value networks, for mini-batches, and reports the last step.
 
