@@ -22,7 +22,9 @@ import torch
 from side_by_side import alternate, conditions, medians, parser, write
 from tensordict import TensorDict
 from torch import Tensor
+from torchrl.envs import Transform, TransformedEnv
 
+from saferl.envs.intersection import BatchedIntersection, Scenario
 from saferl.envs.transforms import SafetyProjector
 from saferl.modules import CriticEnsemble, MMAMValue, PlainMMAMValue, value_operator
 
@@ -68,9 +70,12 @@ def main() -> None:
 
     ours, printed = ensemble(MMAMValue), ensemble(PlainMMAMValue)
     printed.load_state_dict(ours.state_dict())
-    # Everything is risky, and no action is good enough to end early.
+    # Everything is risky, and no action is good enough to end early. The box is the environment's.
+    road = BatchedIntersection(Scenario(), device=options.device)
     forms = {
-        name: SafetyProjector(ours, -1e9, steps=options.steps, compile=name == "compiled")
+        name: TransformedEnv(
+            road, SafetyProjector(ours, -1e9, steps=options.steps, compile=name == "compiled")
+        )
         for name in ("eager", "compiled")
     }
     sides: dict[str, Callable[[], int]] = {}
@@ -82,20 +87,20 @@ def main() -> None:
             return 1
 
         sides[f"plain {batch}"] = whole
-        for name, projector in forms.items():
+        for name, env in forms.items():
 
-            def correct(data: TensorDict = data, projector: SafetyProjector = projector) -> int:
-                projector._inv_call(data.copy())
+            def correct(data: TensorDict = data, correction: Transform = env.transform) -> int:
+                correction.inv(data.copy())
                 return 1
 
             correct()
             sides[f"{name} {batch}"] = correct
-        taken = forms["compiled"]._inv_call(data.copy())["_safety_projection", "projection_steps"]
+        with torch.no_grad():
+            projected = forms["compiled"].transform.inv(data.copy())
+        taken = projected["_safety_projection", "projection_steps"]
         if not bool((taken == options.steps).all()):
             raise SystemExit(f"Expected {options.steps} steps of each state, got {taken}.")
-        with torch.no_grad():
-            executed = forms["compiled"]._inv_call(data.copy())["action"]
-        difference = (executed - plain(printed, data, options.steps)).abs().amax(-1)
+        difference = (projected["action"] - plain(printed, data, options.steps)).abs().amax(-1)
         print(
             f"batch {batch}: {(difference < 1e-4).float().mean():.0%} of the actions equal plain's"
         )

@@ -8,13 +8,15 @@ from collections.abc import Callable
 import torch
 
 
-def compiled(function: Callable, mode: str | None = None) -> Callable:
+def compiled(function: Callable, mode: str | None = None, cpp: bool = False) -> Callable:
     """``function`` compiled, each shape of its inputs anew, without warnings about how TensorDict compiles.
 
     Args:
         function: of tensors, TensorDicts and modules.
         mode: as of ``torch.compile``; ``"reduce-overhead"`` replays CUDA graphs, so that a GPU does not
             wait for Python, and what a call returns is valid until the next call.
+        cpp: call the kernels from C++ in place of Python, for a ``function`` on CPU that is many small ones;
+            without ``mode``.
 
     Examples:
         >>> import torch
@@ -22,7 +24,8 @@ def compiled(function: Callable, mode: str | None = None) -> Callable:
         >>> compiled(torch.sin)(torch.zeros(2))
         tensor([0., 0.])
     """
-    fast = torch.compile(function, dynamic=False, mode=mode)
+    options = {"cpp_wrapper": True} if cpp else None
+    fast = torch.compile(function, dynamic=False, mode=mode, options=options)
 
     def quietly(*args, **kwargs):
         with warnings.catch_warnings():  # at the first call, or at a later one with another shape

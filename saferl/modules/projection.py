@@ -17,7 +17,7 @@ from saferl.modules.compiling import compiled
 log = logging.getLogger(__name__)
 
 #: Steps between two looks at whether any sample still moves, in compiled code.
-_TOGETHER = 5
+_TOGETHER = 10
 
 
 @dataclass(frozen=True)
@@ -110,10 +110,10 @@ def _descend(
 
 
 @functools.cache
-def _compiled() -> tuple[Callable, Callable]:
+def _compiled(cpp: bool) -> tuple[Callable, Callable]:
     """The two functions compiled, once for the process; see :func:`project` on what compiles them anew."""
     log.info("Compiling the projection at its first use: this takes about a minute.")
-    return compiled(_evaluate), compiled(_descend)
+    return compiled(_evaluate, cpp=cpp), compiled(_descend, cpp=cpp)
 
 
 def project(
@@ -189,7 +189,7 @@ def project(
     start = action.detach()
     evaluate, descend, together = _evaluate, _descend, 1
     if compile:
-        (evaluate, descend), together = _compiled(), _TOGETHER
+        (evaluate, descend), together = _compiled(start.device.type == "cpu"), _TOGETHER
     risk_before, slope = evaluate(risk_fn, start)
     none = torch.zeros_like(risk_before, dtype=torch.int64)
     risky = risk_before > limit

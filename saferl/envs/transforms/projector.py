@@ -46,18 +46,19 @@ def _risk_of_action(
 
 
 @functools.cache
-def _compiled_risk() -> Callable:
-    return compiled(_risk_of_action)
+def _compiled_risk(cpp: bool) -> Callable:
+    return compiled(_risk_of_action, cpp=cpp)
 
 
 class SafetyProjector(Transform):
     """Executes a corrected action wherever the risk of the proposed one exceeds a limit.
 
     The correction is :func:`saferl.modules.project` (paper, E8 to E10) on the risk
-    Q_c(s, a) that ``risk`` predicts, within the box of the environment's action spec. Append it outermost, outside a ``SerialEnv`` or
-    ``ParallelEnv``: it then meets the policy's own action, random warm-up actions included, with
-    all environments in one batch. ``action`` in collected data stays the proposed one, whose
-    log-probability the policy knows; :class:`ExecutedAction` swaps it in an off-policy buffer.
+    Q_c(s, a) that ``risk`` predicts, within the box of the environment's action spec. Append it
+    outermost, outside a ``SerialEnv`` or ``ParallelEnv``: it then meets the policy's own action, random
+    warm-up actions included, with all environments in one batch. ``action`` in collected data stays the
+    proposed one, whose log-probability the policy knows; :class:`ExecutedAction` swaps it in an
+    off-policy buffer.
 
     Args:
         risk: a TensorDictModule that reads observation entries and the action and writes the risk
@@ -156,7 +157,9 @@ class SafetyProjector(Transform):
 
     def _look(self, inputs: TensorDictBase) -> tuple[Callable[[Tensor], Tensor], Tensor]:
         """What :func:`_risk_of_action` makes of the states and actions in ``inputs`` [N]."""
-        look = _compiled_risk() if self.settings["compile"] else _risk_of_action
+        look = _risk_of_action
+        if self.settings["compile"]:
+            look = _compiled_risk(inputs.get(self.action_key).device.type == "cpu")
         return look(self.risk, self.action_key, inputs)
 
     def _in_parts(self, risky: Tensor) -> Sequence[Tensor | slice]:
