@@ -1,0 +1,75 @@
+"""Every benchmark still runs, in a small form."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parents[1]
+FAST = ["encoder.policy.width=16", "warmup_frames=64", "batch_size=16", "compile=false"]
+SHORT = ["--rounds", "1", "--seconds", "0.1"]
+ABLATION = ["--runs", "algo=sac", "--seeds", "0", "--tasks", "gs", "--episodes", "5", "--jobs", "1"]
+
+
+def command(*arguments: str | Path) -> str:
+    env = os.environ | {"OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, *map(str, arguments)], cwd=ROOT, env=env, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    """A short training of ARSAC and a test of it."""
+    out = tmp_path_factory.mktemp("trained") / "run"
+    small = ["algo=arsac", "task=gs", "env=batched", "env.num_envs=16", "frames=512", *FAST]
+    command("-m", "saferl", *small, f"out={out}")
+    where = f"checkpoint={out}"
+    command("-m", "saferl.evaluate", where, "task=gs", "episodes=5", f"out={out}/test")
+    return out
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["highway", *SHORT],
+        ["simulation", "--batches", "4", *SHORT],
+        ["projector", "--batches", "2", "--width", "16", "--steps", "10", *SHORT],
+        ["update", "--width", "16", "--batch", "8", *SHORT],
+        ["threads", "--algos", "sac_lag", "--spins", "default", "--width", "16", *SHORT],
+        ["training", "--algos", "sac_lag", "--episodes", "20", "--set", *FAST],
+        ["traffic", "--episodes", "5"],
+        ["reward_audit", "--episodes", "4"],
+        ["mmam_forms", "--seeds", "0", "--updates", "20", "--width", "16"],
+    ],
+    ids=lambda arguments: arguments[0],
+)
+def test_of_nothing(arguments: list[str]):
+    assert command(f"benchmarks/{arguments[0]}.py", *arguments[1:])
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["calibration", "{run}", "--episodes", "5"],
+        ["cost_critics", "{run}", "--updates", "20", "--width", "16"],
+        ["projection", "{run}", "--samples", "64"],
+        ["backends", "{run}", "--episodes", "4", "--tasks", "gs", "--drivers", "blind"],
+        ["curves", "{out}/curves.png", "ARSAC={run}"],
+        ["compare", "{run}/test", "{run}/test"],
+        ["ablation", "{out}", "--train", "gs", *ABLATION, "--set", "frames=512", *FAST],
+        ["updates_per_frame", "{out}", "--values", "0.25", "--minutes", "0.05", "--seeds", "0",
+         "--task", "gs", "--set", *FAST],
+    ],
+    ids=lambda arguments: arguments[0],
+)  # fmt: skip
+def test_of_a_run(arguments: list[str], run: Path, tmp_path: Path):
+    name, *rest = (argument.format(run=run, out=tmp_path) for argument in arguments)
+    command(f"benchmarks/{name}.py", *rest)
+    assert name != "curves" or (tmp_path / "curves.png").stat().st_size > 1000
