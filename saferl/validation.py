@@ -90,11 +90,16 @@ def check_training(cfg: DictConfig) -> None:
     for key in ("batch_size", "demonstrations"):
         if cfg.buffer_size < cfg[key]:
             raise ValueError(f"buffer_size must be >= {key}, got {cfg.buffer_size} and {cfg[key]}.")
-    collected = cfg.env.num_envs * cfg.collector.frames_per_env
-    if cfg.buffer_size < collected and cfg.experience._target_.endswith("Replay"):
-        raise ValueError(
-            f"buffer_size must be >= env.num_envs * collector.frames_per_env, got {cfg.buffer_size} and {collected}."
-        )
+    if cfg.experience._target_.endswith("Replay"):
+        collected = cfg.env.num_envs * cfg.collector.frames_per_env
+        if cfg.buffer_size < collected:
+            raise ValueError(
+                f"buffer_size must be >= env.num_envs * collector.frames_per_env, got {cfg.buffer_size} and {collected}."
+            )
+        if cfg.frames is not None and cfg.frames < cfg.warmup_frames:
+            raise ValueError(
+                f"warmup_frames must be <= frames, or nothing is learned, got {cfg.warmup_frames} and {cfg.frames}."
+            )
     check_targets(cfg)
 
 

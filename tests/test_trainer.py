@@ -301,7 +301,7 @@ def test_no_episode_need_end(tmp_path: Path):
 
 
 def test_compiling_leaves_everyones_warnings_alone(tmp_path: Path, monkeypatch):
-    def compile(loss, dynamic, mode):
+    def compile(loss, **_):
         def compiled(batch):
             warn_explicit("of how it compiles", UserWarning, "utils.py", 1, "tensordict.utils")
             return loss(batch)
