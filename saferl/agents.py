@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,9 +52,22 @@ def device_of(cfg: DictConfig) -> torch.device:
     return torch.device(name)
 
 
-def make(node: DictConfig, **objects: Any) -> Any:
-    """Instantiate a node with live objects, which Hydra itself would turn into configurations."""
-    return hydra.utils.instantiate(node, _partial_=True)(**objects)
+def make(node: DictConfig, settings: Mapping[str, Any] | None = None, **objects: Any) -> Any:
+    """Instantiate a node with live objects, which Hydra itself would turn into configurations.
+
+    Args:
+        node: with a ``_target_``.
+        settings: in place of the node's own.
+        **objects: arguments that the node may not set.
+
+    Raises:
+        ValueError: the node sets what the composition gives.
+    """
+    for key in set(node) & set(objects):
+        raise ValueError(
+            f"{node._get_full_key(key)} cannot be set: it follows from the rest of the configuration."
+        )
+    return hydra.utils.instantiate(node, _partial_=True, **(settings or {}))(**objects)
 
 
 @dataclass

@@ -72,7 +72,9 @@ def build_env(
             f"{cfg.env._target_} plays a {kind.__name__}, but task={scenario.task} is a "
             f"{type(scenario).__name__}: leave env= to the task."
         )
-    env = make(cfg.env, scenario=scenario, num_envs=num_envs, seed=seed, device=device_of(cfg))
+    # A test has a number of environments of its own.
+    settings = {"num_envs": num_envs}
+    env = make(cfg.env, settings, scenario=scenario, seed=seed, device=device_of(cfg))
     return TransformedEnv(env, Compose(*transforms)) if transforms else env  # pyright: ignore
 
 

@@ -106,12 +106,15 @@ def _unknown_key(key: str, config: str, arguments: list[str]) -> str:
         parent, _, name = parent.rpartition(".")
         node = OmegaConf.select(composed, parent) if parent else composed
     choices = [str(k) for k in node if k != "_target_"]
-    if not choices:  # an empty mapping: what it may hold, its class says
-        return f"unknown key {key!r}; {parent} is empty by default, set it with +{key}=..."
     if "_target_" in node:
         from saferl import validation  # late, as it imports the target
 
-        choices = list(validation.arguments(node._target_) or choices)
+        accepted = validation.arguments(node._target_)
+        if accepted == {}:
+            return f"unknown key {key!r}; {node._target_} takes nothing."
+        choices = list(accepted or choices)
+    if not choices:  # an empty mapping: what it may hold, its class says
+        return f"unknown key {key!r}; {parent} is empty by default, set it with +{key}=..."
     if name in choices:
         return f"{key!r} stands at the default of its class; set it with +{key}=..."
     close = difflib.get_close_matches(name, choices, n=1)

@@ -111,15 +111,16 @@ def episode_rows(steps: list[TensorDictBase], seeds: Tensor) -> list[dict]:
 
     alive = torch.stack([step["alive"] for step in steps]).cpu()
     values = {"return": over_time("reward"), "cost_return": over_time("cost")}
-    moved = shift = torch.zeros_like(values["cost_return"])
+    shift = torch.zeros_like(values["cost_return"])
     if "action_executed" in after:
-        moved = over_time("intervened")
         shift = torch.stack(
             [
                 torch.linalg.vector_norm(step["next", "action_executed"] - step["action"], dim=-1)
                 for step in steps
             ]
         ).cpu()
+    # A projector of one's own need not say where it intervened.
+    moved = over_time("intervened") if "intervened" in after else (shift > 0).to(shift)
     values |= {"intervention_rate": moved, "correction": shift}
     if "ego" in after:
         ego = over_time("ego")

@@ -211,6 +211,8 @@ def arguments(target: str) -> dict[str, Any] | None:
         raise ValueError(f"_target_ names nothing that can be imported: {target!r}.") from error
     # A metaclass, as TorchRL's environments have, hides what __init__ takes.
     function = function.__init__ if inspect.isclass(function) else function
+    if function is object.__init__:
+        return {}
     try:
         signature = inspect.signature(function, eval_str=True)
     except NameError:  # annotations that exist for type checkers alone

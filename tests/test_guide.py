@@ -23,10 +23,11 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("my_project")
     for kind, text in BLOCKS:
         if kind in ("python", "yaml"):
-            path = root / text.splitlines()[0].removeprefix("# ")
+            name = re.search(r"^# (my_\S+)$", text, re.MULTILINE)
+            assert name, text
+            path = root / name[1]
             path.parent.mkdir(parents=True, exist_ok=True)
-            # The first line is the guide's own: a package must be on the first.
-            path.write_text(text.split("\n", 1)[1])
+            path.write_text(text)
     return root
 
 

@@ -30,7 +30,7 @@ class GymTask:
             cost itself.
         kwargs: of the environment.
         size, action_dim: numbers of an observation and of an action: the environment's own.
-        horizon: decisions of an episode at most; None: as many as the environment is registered with.
+        horizon: decisions of an episode at most, in place of the environment's own limit; None: that one.
         task: what runs are called.
 
     Raises:
@@ -95,7 +95,7 @@ class GymTask:
         for key, value in found.items():
             if getattr(self, key) not in (None, value):
                 raise ValueError(f"task.{key} is {value} in {self.id}, got {getattr(self, key)}.")
-        return {**found, "horizon": min(x for x in (self.horizon, limit) if x is not None)}
+        return {**found, "horizon": limit if self.horizon is None else self.horizon}
 
 
 class GymEnvs(ReplayedEnv):

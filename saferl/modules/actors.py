@@ -8,7 +8,7 @@ import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.data import Bounded, TensorSpec
+from torchrl.data import Bounded
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
@@ -49,13 +49,12 @@ def tanh_gaussian_actor(
     in_keys: Sequence[NestedKey] = ("ego", "vehicles"),
     *,
     scale_lb: float = 1e-4,
-    spec: TensorSpec | None = None,
 ) -> ProbabilisticActor:
     """A tanh-squashed Gaussian policy, as soft actor-critic needs (Haarnoja et al., 2018).
 
-    With u ~ N(loc, scale^2) the action is tanh(u); under
-    ``set_exploration_type(ExplorationType.DETERMINISTIC)`` it is tanh(loc). Actions stay 1e-6 (float32) inside the box so that their log-probability can be
-    computed from a stored action too.
+    With u ~ N(loc, scale^2) the action is tanh(u), in the box [-1, 1]^A (TorchRL's ``ActionScaling`` brings another box
+    to this one); under ``set_exploration_type(ExplorationType.DETERMINISTIC)`` it is tanh(loc). Actions stay 1e-6
+    (float32) inside the box so that their log-probability can be computed from a stored action too.
 
     Args:
         encoder: maps the entries ``in_keys`` to features [*B, width].
@@ -63,7 +62,6 @@ def tanh_gaussian_actor(
         action_dim: A, size of the action.
         in_keys: entries that the encoder takes, in its order.
         scale_lb: smallest standard deviation before the tanh.
-        spec: the environment's action spec; ``None`` is the box [-1, 1]^A.
 
     Reads ``in_keys``. Writes ``loc``, ``scale`` and ``action`` [*B, A], ``action_log_prob`` [*B].
 
@@ -76,14 +74,12 @@ def tanh_gaussian_actor(
         >>> actor(td)["action"].shape, td["action_log_prob"].shape
         (torch.Size([5, 2]), torch.Size([5]))
     """
-    if spec is None:
-        spec = Bounded(low=-1.0, high=1.0, shape=torch.Size((action_dim,)))
     head = GaussianHead(encoder, width, action_dim, scale_lb)
     return ProbabilisticActor(
         TensorDictModule(head, in_keys=list(in_keys), out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
         out_keys=["action"],
-        spec=spec,
+        spec=Bounded(low=-1.0, high=1.0, shape=torch.Size((action_dim,))),
         distribution_class=TanhNormal,
         # Without safe_tanh float32 rounds tanh(9.1) to 1, whose inverse is infinite.
         distribution_kwargs={"low": -1.0, "high": 1.0, "safe_tanh": True},

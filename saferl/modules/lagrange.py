@@ -26,7 +26,8 @@ class LagrangeMultiplier(nn.Module):
     A state-wise constraint (``signed=False``) counts only the samples that violate it, and its
     multiplier cannot fall (E11, paper). A signed one averages surplus and shortage.
 
-    All state is in float64 buffers, which a float32 loss can multiply by without being promoted.
+    All state is in float64 buffers, which a float32 loss can multiply by without being promoted;
+    ``loss.float()`` would round small updates away.
 
     Args:
         init: first value.

@@ -202,7 +202,7 @@ class CPOLoss(CostValueLoss, PPOLoss):
         """The discounted cost of an episode of the policy that collected a batch, and its decisions.
 
         Means over the episodes that ended lately (:class:`~saferl.objectives.episodes.EpisodeCost`); before
-        the first end, what the running episodes have cost so far and V_c of the rest.
+        the first end, what the running episodes have cost so far and V_c of the rest, as if they went on for ever.
 
         Args:
             tensordict: ``[*B, T]`` as :meth:`CostValueLoss.begin` leaves it; ``"is_init"`` (of TorchRL's
@@ -222,8 +222,12 @@ class CPOLoss(CostValueLoss, PPOLoss):
             last = following[..., -1].select(*self.cost_critic.in_keys)
             ahead = self.cost_critic(last).get(keys.state_cost_value).squeeze(-1)
         so_far, weight, discount, _ = self.episodes.running.unbind(-1)
-        rest = torch.where(done[..., -1], 0.0, discount * ahead)
-        return (so_far + rest).mean().to(cost), weight.mean().to(cost)
+        discount = torch.where(done[..., -1], 0.0, discount)
+        # V_c is of as many decisions as a discount lets count; without one nobody knows how many.
+        gamma = float(self._cost_value_estimator.gamma)
+        left = 1 / (1 - gamma) if gamma < 1 else 0.0
+        total, weight = so_far + discount * ahead, weight + discount * left
+        return total.mean().to(cost), weight.mean().to(cost)
 
     def _surrogates(
         self, batch: TensorDictBase, old: Distribution

@@ -99,9 +99,10 @@ def test_six_values_under_a_time_limit(name: str):
     assert env.rollout(9, constant(0.0)).shape[1] == 3
 
 
-def test_a_horizon_shortens_episodes_and_never_lengthens_them():
+def test_a_horizon_takes_the_place_of_the_environments_limit():
     assert GymTask("test/Walk-v0", horizon=3).complete()["horizon"] == 3
-    assert GymTask("test/Walk-v0", horizon=30).complete()["horizon"] == 5
+    assert GymTask("test/Walk-v0", horizon=30).complete()["horizon"] == 30
+    assert GymTask("test/Walk-v0").complete()["horizon"] == 5
     with pytest.raises(ValueError, match="task.horizon must be null or >= 1, got 0"):
         GymTask("test/Walk-v0", horizon=0)
 

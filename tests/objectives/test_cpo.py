@@ -59,6 +59,8 @@ def test_cost_of_the_policy_is_that_of_whole_episodes(gamma: float):
             rest = gamma**7 * rest["state_cost_value"].squeeze(-1)
             sums = [sum(c * gamma**t for t, c in enumerate(costs)) for costs in played]
             assert float(cost) == pytest.approx(sum(sums) / 4 + float(rest.mean()))
+            ahead = 7 if gamma == 1 else 1 / (1 - gamma)  # of an episode without an end
+            assert float(weight) == pytest.approx(ahead)
         else:
             expected = (known[:2] / known[2]).tolist()
             assert (float(cost), float(weight)) == pytest.approx(expected)
