@@ -30,7 +30,7 @@ from saferl.learner import Learner
 from saferl.modules import compiled
 from saferl.progress import Budget
 from saferl.trainer import Trainer
-from saferl.validation import check_targets, check_training
+from saferl.validation import arguments, check_targets, check_training
 
 #: What is kept of a transition besides the observation.
 STORED = (
@@ -51,6 +51,10 @@ def complete(cfg: DictConfig) -> None:
     Raises:
         ValueError: the task's settings cannot be meant.
     """
+    if "reward" in cfg.task and "reward" not in (arguments(cfg.task._target_) or {"reward"}):
+        raise ValueError(
+            f"shaping changes the road's reward, which task={cfg.task.task} has not: set shaping=none."
+        )
     check_targets(cfg.task, "task")
     task = hydra.utils.instantiate(cfg.task)
     if hasattr(task, "complete"):

@@ -56,6 +56,7 @@ MISTAKES = [
     (TRAIN, "algo=sac_lag +env.seed=5", "env.seed cannot be set: it follows from the rest"),
     (TRAIN, "lagrange.signal.cost_limit=1", "saferl.hooks.CriticSignal takes nothing"),
     (TRAIN, "+lagrange.signal.cost_limit=1", "unknown key lagrange.signal.cost_limit"),
+    (TRAIN, "algo=ppo_rs task=cart", "which task=cart has not: set shaping=none"),
     (TRAIN, "alpha_init=0", "alpha_init must be a number, > 0, got 0"),
     (TRAIN, "evaluation.episodes=0", "evaluation.episodes must be a whole number, >= 1, got 0"),
     (TRAIN, "projector.step_size=-1", "step_size must be finite and > 0, got -1"),
