@@ -187,7 +187,7 @@ class Trainer:
     @contextmanager
     def _logging(self) -> Iterator[None]:
         """Opens the loggers and tells them the rows of ``metrics.csv``, which a resume has cut off at
-        its checkpoint, in place of what an earlier session told them."""
+        its checkpoint, in place of what an earlier process told them."""
         self._loggers = self.open_loggers()
         try:
             for sink in [logger.experiment for logger in self._loggers]:
