@@ -82,8 +82,9 @@ class _SceneTokens(nn.Module):
         features, present = scale_vehicles(vehicles, self.vehicle_scale)
         ego_token = F.gelu(self.ego(scale_ego(ego, self.ego_scale))).unsqueeze(-2)
         tokens = torch.cat([ego_token, F.gelu(self.vehicle(features))], dim=-2)
-        # The EV is always there, so no softmax ever runs over absent rows alone.
-        return tokens, F.pad(present, (1, 0), value=True)
+        # The EV is always there, so no softmax ever runs over absent rows alone. Not F.pad: in float64
+        # torch 2.13 generates C++ from it that does not compile for AVX2.
+        return tokens, torch.cat([present.new_ones((*present.shape[:-1], 1)), present], dim=-1)
 
 
 class _Attention(nn.Module):
