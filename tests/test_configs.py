@@ -159,7 +159,7 @@ def test_algorithm_builds_and_makes_updates(algo: str, task: str, tmp_path: Path
     cfg = compose(*SMALL, *options)
     if task in ("cart", "gym"):
         if cfg.task.get("reward"):
-            with pytest.raises(ValueError, match=r"set shaping=none"):
+            with pytest.raises(ValueError, match="set shaping=none"):
                 build_trainer(cfg, tmp_path)
             return
         if cfg.encoder.policy._target_.endswith("MMAMPolicyEncoder"):
