@@ -58,7 +58,8 @@ def main() -> None:
     cfg = run_config(options.run)
     cfg.device = "cpu"
     actor = load_agent(cfg, options.run, "checkpoint").actor
-    env = BatchedIntersection(hydra.utils.instantiate(cfg.task), ENVS, seed=options.seed)
+    scenario = hydra.utils.instantiate(cfg.task)
+    env, scales = BatchedIntersection(scenario, ENVS, seed=options.seed), scenario.form.scales
     with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         data = env.rollout(DECISIONS, actor, break_when_any_done=False)
     returns, seen = followed(data, cfg.gamma)
@@ -71,13 +72,14 @@ def main() -> None:
         torch.manual_seed(options.seed)
         critics = [
             value_operator(
-                zero_output(MMAMValue(width=options.width)), out_key="state_action_cost_value"
+                zero_output(MMAMValue(width=options.width, **scales)),
+                out_key="state_action_cost_value",
             )
             for _ in range(2)
         ]
         loss = SACLagLoss(
             actor,
-            [value_operator(MLPValue(rows=cfg.task.rows, width=8)) for _ in range(2)],
+            [value_operator(MLPValue(rows=cfg.task.rows, width=8, **scales)) for _ in range(2)],
             critics,
             lagrange=DualAscent(init=1.0, lr=1e-4),
             cost_target=target,

@@ -40,7 +40,7 @@ RATES = (1e-3, 1e-4)  # first and last
 @torch.no_grad()
 def drive(seed: int) -> TensorDict:
     """Transitions [B, T] with ``expert`` [*, 2] and ``sums`` [*, 2], and whether the sums are ``seen``."""
-    env = BatchedIntersection(Scenario(task="mixed"), ENVS, seed=seed)
+    env = BatchedIntersection(Scenario(task="mixed", observation="world"), ENVS, seed=seed)
     cautious, blind = CautiousDriver(), Driver()
     generator = torch.Generator().manual_seed(seed)
     is_blind = (torch.arange(ENVS) % 2 == 1).unsqueeze(-1)

@@ -28,11 +28,13 @@ from saferl.components import BufferState
 from saferl.envs.intersection import CollisionCost
 from saferl.envs.intersection.dynamics import step_ego, to_physical
 from saferl.envs.intersection.geometry import offroad
+from saferl.envs.intersection.observation import as_world
 from saferl.modules import project
 
 
 def physics(ego: torch.Tensor, vehicles: torch.Tensor, action: torch.Tensor) -> tuple[float, float]:
     """Mean Algorithm 2 cost, and share that leaves the road within 1 s under a held action."""
+    ego, vehicles = as_world(ego, vehicles)
     state, control = ego[:, 1:7], to_physical(action)
     cos, sin = torch.cos(state[:, 4]), torch.sin(state[:, 4])
     own = torch.stack(

@@ -101,7 +101,7 @@ def main() -> None:
             for name in drivers():
                 values = [
                     discounted(
-                        Scenario(task=task, vehicles=0, rows=1, reward=reward),
+                        Scenario(task=task, vehicles=0, rows=1, reward=reward, observation="world"),
                         drivers()[name],
                         args.episodes,
                     )[0]

@@ -61,7 +61,9 @@ with torch.no_grad():
     data["next"] = policy(data["next"])
 
 critics = [
-    value_operator(zero_output(MLPValue(width=128)), out_key="state_action_cost_value")
+    value_operator(
+        zero_output(MLPValue(width=128, **scenario.form.scales)), out_key="state_action_cost_value"
+    )
     for _ in range(2)
 ]
 risk = CriticEnsemble(critics, reduce="max")

@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from saferl.envs.intersection import Scenario
 from saferl.envs.intersection.geometry import ROUTES
+from saferl.envs.intersection.observation import reading
 from saferl.envs.seeding import episode_seeds
 from saferl.metrics import summarise
 
@@ -124,7 +125,7 @@ def episode_rows(steps: list[TensorDictBase], seeds: Tensor) -> list[dict]:
     values |= {"intervention_rate": moved, "correction": shift}
     if "ego" in after:
         ego = over_time("ego")
-        values["speed"] = torch.hypot(ego[..., 3], ego[..., 4])
+        values["speed"] = torch.hypot(reading(ego, "v_x"), reading(ego, "v_y"))
         ends = {key: over_time(key, torch.bool) for key in ("collision", "offroad", "success")}
         routes = steps[0].get("route").flatten().tolist()
     rows = []
@@ -142,7 +143,7 @@ def episode_rows(steps: list[TensorDictBase], seeds: Tensor) -> list[dict]:
                 "hit_vehicle": int(hit),
                 "left_road": int(left),
                 "speed": total["speed"] / count,
-                "min_distance": ego[:count, index, 7].min().item(),
+                "min_distance": reading(ego, "d_veh")[:count, index].min().item(),
             }
         row |= {
             "return": total["return"],

@@ -16,7 +16,9 @@ COAST, BRAKE, HARD_LEFT = (0.0, 0.0), (-1.0, 0.0), (0.0, -1.0)
 
 
 def make(num_envs=1, seed=0, **settings):
-    return BatchedIntersection(Scenario(**{"vehicles": 0} | settings), num_envs, seed)
+    """An empty road by default, observed by coordinates that a test can read off."""
+    usual = {"vehicles": 0, "observation": "world"}
+    return BatchedIntersection(Scenario(**usual | settings), num_envs, seed)
 
 
 def reset(env, seeds=None):

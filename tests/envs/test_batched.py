@@ -27,15 +27,15 @@ from saferl.envs.seeding import episode_seeds, mix, uniform
 @pytest.mark.parametrize("num_envs", [1, 64])
 @pytest.mark.parametrize("task", ["lt", "gs", "rt", "mixed"])
 def test_specs(task, num_envs):
-    env = make(num_envs, task=task)
+    env = make(num_envs, task=task, observation="route")
     check_env_specs(env, seed=0)
     rewards = env.full_reward_spec
     assert set(rewards.keys()) == {"reward", "cost"}
     for key in ("reward", "cost"):
         assert rewards[key].shape == (num_envs, 1) and rewards[key].dtype == torch.float32
     assert set(env.observation_spec.keys()) == set(OBSERVATION)
-    assert env.observation_spec["ego"].shape == (num_envs, 9)
-    assert env.observation_spec["vehicles"].shape == (num_envs, 11, 6)
+    assert env.observation_spec["ego"].shape == (num_envs, 17)
+    assert env.observation_spec["vehicles"].shape == (num_envs, 11, 13)
     assert env.action_spec.space.low.unique().item() == -1.0
     assert env.action_spec.space.high.unique().item() == 1.0
     fresh = env.reset()
@@ -48,12 +48,20 @@ def test_rows_are_a_setting():
     assert env.reset()["vehicles"].shape == (2, 4, 6)
 
 
+def test_the_observation_is_a_setting():
+    env = make(2, observation="world")
+    check_env_specs(env, seed=0)
+    fresh = env.reset()
+    assert fresh["ego"].shape == (2, 9) and fresh["vehicles"].shape == (2, 11, 6)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"task": "uturn"}, "task must be one of lt, gs, rt, mixed, got 'uturn'"),
         ({"vehicles": -1}, "vehicles must be >= 0, got -1"),
         ({"rows": 0}, "rows must be >= 1, got 0"),
+        ({"observation": "map"}, "observation must be one of route, world, got 'map'"),
         ({"policy_frequency": 0}, "policy_frequency must be > 0, got 0"),
         ({"duration": 0.0}, r"duration must be at least a decision, 0.2 seconds, got 0.0"),
         ({"route_starts": 1.5}, r"route_starts must be in \[0, 1\], got 1.5"),

@@ -18,7 +18,7 @@ NORTH = -math.pi / 2
 
 def play(driver, task, frequency=5, num_envs=64, seed=0):
     """Whether each first episode succeeded, the actions taken and the speeds reached in it."""
-    scenario = Scenario(task=task, vehicles=0, policy_frequency=frequency)
+    scenario = Scenario(task=task, vehicles=0, policy_frequency=frequency, observation="world")
     env = BatchedIntersection(scenario, num_envs=num_envs, seed=seed)
     tensordict = env.reset()
     alive = torch.ones(num_envs, dtype=torch.bool)

@@ -127,7 +127,7 @@ def test_starts_are_40_m_before_the_box_or_along_the_route():
             seen.add(round(x, 6))
             assert info["task"] == task
         assert sorted(seen) == lanes
-    env = IntersectionEnv(task="gs", vehicles=0, route_starts=1.0)
+    env = IntersectionEnv(task="gs", vehicles=0, route_starts=1.0, observation="world")
     ys = [env.reset(seed=seed)[0]["ego"][2] for seed in range(60)]
     assert min(ys) < -15.0
     assert max(ys) > 40.0
@@ -197,7 +197,7 @@ def test_surrounding_vehicles_never_overlap():
 
 
 def test_no_vehicle_is_a_valid_scene():
-    env = IntersectionEnv(task="lt", vehicles=0)
+    env = IntersectionEnv(task="lt", vehicles=0, observation="world")
     observation, _ = env.reset(seed=0)
     assert observation["ego"][7] == 70.0
     assert not observation["vehicles"].any()
@@ -208,7 +208,7 @@ def test_no_vehicle_is_a_valid_scene():
 
 
 def test_observed_vehicles_are_those_of_the_snapshot():
-    env = IntersectionEnv(task="lt")
+    env = IntersectionEnv(task="lt", observation="world")
     observation, _ = env.reset(seed=1)
     ego, vehicles = env.snapshot()
     delta = vehicles[:, :2] - ego[:2]

@@ -18,9 +18,11 @@ from tensordict import TensorDict
 from saferl.envs.intersection import SCENARIOS, IntersectionEnv, Scenario, Traffic
 from saferl.envs.intersection.base import OUTCOMES
 from saferl.envs.intersection.batched import advance, begin, look, vehicles_of
+from saferl.envs.intersection.cost import CollisionCost
 from saferl.envs.intersection.drivers import CautiousDriver
 from saferl.envs.intersection.geometry import ARM, LENGTH, WIDTH, frame, overlap
 from saferl.envs.intersection.network import build_network, routes
+from saferl.envs.intersection.observation import FORMS
 from saferl.envs.intersection.regulation import IntersectionRoad
 from saferl.envs.intersection.roads import lane_frames, lane_project, lanes, pairs, zones
 from saferl.envs.intersection.spawning import Drawn, draw_traffic
@@ -214,13 +216,17 @@ def waits_in_a_scene(seed) -> int:
 # --- whole episodes ------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("observation", FORMS)
 @pytest.mark.parametrize("name", list(SCENARIOS))
 @pytest.mark.parametrize("task", ["lt", "gs", "rt"])
-def test_an_episode_is_the_same_on_both_backends(task, name):
+def test_an_episode_is_the_same_on_both_backends(task, name, observation):
     """Observation, reward, cost and ends, decision by decision, at the rates of training and test."""
     frequency = 10 if task == "gs" else 5
-    scenario = Scenario(task=task, scenario=name, policy_frequency=frequency)
-    env = IntersectionEnv(task=task, scenario=name, policy_frequency=frequency)
+    settings = {"policy_frequency": frequency, "observation": observation}
+    # Unlike a prediction, what a crash itself costs is known to no observation.
+    settings["cost"] = CollisionCost(crash=0.7)
+    scenario = Scenario(task=task, scenario=name, **settings)
+    env = IntersectionEnv(task=task, scenario=name, **settings)
     seed = int(episode_seeds(7, 3)[["lt", "gs", "rt"].index(task)])
     seen, _ = env.reset(seed=seed)
     state = begin(scenario, torch.tensor([seed]))

@@ -242,19 +242,25 @@ def test_state_dict_continues_bit_for_bit_in_the_middle_of_an_episode():
 
 
 def test_replay_does_not_depend_on_the_callers_memory():
-    env = HighwayIntersection(Scenario(task="gs", vehicles=2), num_envs=1, seed=1)
+    env = HighwayIntersection(
+        Scenario(task="gs", vehicles=2, observation="world"), num_envs=1, seed=1
+    )
     reset(env)
     buffer = TensorDict({"action": torch.tensor([[0.5, 0.0]])}, batch_size=[1])
     view = env.step(buffer)["next"].clone()
     buffer["action"].fill_(-1.0)  # a collector that writes its next action in place
-    other = HighwayIntersection(Scenario(task="gs", vehicles=2), num_envs=1, seed=2)
+    other = HighwayIntersection(
+        Scenario(task="gs", vehicles=2, observation="world"), num_envs=1, seed=2
+    )
     other.load_state_dict(env.state_dict())
     assert same(step(other, (0.1, 0.0)), step(env, (0.1, 0.0)))
     assert view["ego"][0, 3] > 6.0
 
 
 def test_snapshot_and_render_show_one_environment():
-    env = HighwayIntersection(Scenario(task="lt", vehicles=6), num_envs=2, seed=1)
+    env = HighwayIntersection(
+        Scenario(task="lt", vehicles=6, observation="world"), num_envs=2, seed=1
+    )
     view = reset(env)
     ego, others = env.snapshot(1)
     assert torch.allclose(torch.tensor(ego).float(), view["ego"][1, 1:7])

@@ -17,7 +17,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 
 from saferl.envs.intersection.cost import CollisionCost
 from saferl.envs.intersection.geometry import ROUTES, ROUTES_OF_TASK
-from saferl.envs.intersection.observation import ROWS
+from saferl.envs.intersection.observation import FORMS, ROWS, Form
 from saferl.envs.intersection.reward import Reward
 from saferl.envs.intersection.spawning import SCENARIOS, Traffic
 from saferl.envs.intersection.traffic import PERIOD
@@ -59,6 +59,7 @@ class Scenario:
         task: ``lt``, ``gs``, ``rt``, or ``mixed`` (one drawn at each reset).
         vehicles: surrounding vehicles drawn at reset; None: as many as the scenario says.
         rows: M, rows of the ``vehicles`` observation; one is always padding.
+        observation: a name in :data:`FORMS`: ``route``, along the ego's route, or ``world`` (paper).
         scenario: the traffic: a name in :data:`SCENARIOS`.
         traffic: a :class:`Traffic`, or a mapping of what differs from the scenario's.
         policy_frequency: decisions per second; each is integrated in 3 substeps.
@@ -81,6 +82,7 @@ class Scenario:
     scenario: str = "nominal"
     traffic: Traffic = field(default_factory=dict)  # pyright: ignore  (a mapping becomes a Traffic)
     rows: int = ROWS
+    observation: str = "route"
     policy_frequency: int = 5
     duration: float = 25.0
     route_starts: float = 0.0
@@ -95,6 +97,10 @@ class Scenario:
             raise ValueError(f"vehicles must be >= 0, got {self.vehicles}.")
         if self.rows < 1:
             raise ValueError(f"rows must be >= 1, got {self.rows}.")
+        if self.observation not in FORMS:
+            raise ValueError(
+                f"observation must be one of {', '.join(FORMS)}, got {self.observation!r}."
+            )
         if self.policy_frequency <= 0:
             raise ValueError(f"policy_frequency must be > 0, got {self.policy_frequency}.")
         if not 0 < self.duration < float("inf") or self.horizon < 1:
@@ -121,6 +127,11 @@ class Scenario:
             raise ValueError(f"standstill must be null or > 0 seconds, got {self.standstill}.")
 
     @property
+    def form(self) -> Form:
+        """The features of the observation, and their scales for an encoder: ``**form.scales``."""
+        return FORMS[self.observation]
+
+    @property
     def rules_every(self) -> int:
         """Decisions of the ego between two of the traffic."""
         return max(1, round(PERIOD * self.policy_frequency))
@@ -144,8 +155,8 @@ class Scenario:
 class IntersectionBase(SeededEnv):
     """Specs and seeding of the intersection; subclasses drive it.
 
-    Reads ``action`` [B, 2] in [-1, 1]: a_x / 5 m/s^2, delta_f / 0.6 rad. Writes ``ego`` [B, 9] and
-    ``vehicles`` [B, M, 6] (:func:`observe`), ``route`` [B, 1] int64, the outcomes ``collision``,
+    Reads ``action`` [B, 2] in [-1, 1]: a_x / 5 m/s^2, delta_f / 0.6 rad. Writes ``ego`` [B, F] and
+    ``vehicles`` [B, M, G] (:func:`observe`), ``route`` [B, 1] int64, the outcomes ``collision``,
     ``offroad``, ``success`` [B, 1] bool, and ``reward`` and ``cost`` [B, 1].
 
     A reset may be told which episodes to play by an int64 key ``seed`` [B] or [B, 1]; without it
@@ -159,11 +170,11 @@ class IntersectionBase(SeededEnv):
         self.set_seed(seed)
 
     def _make_specs(self) -> None:
-        batch = self.batch_size
+        batch, form = self.batch_size, self.scenario.form
         flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool)
         self.observation_spec = Composite(
-            ego=Unbounded(shape=(*batch, 9)),
-            vehicles=Unbounded(shape=(*batch, self.scenario.rows, 6)),
+            ego=Unbounded(shape=(*batch, len(form.ego))),
+            vehicles=Unbounded(shape=(*batch, self.scenario.rows, len(form.vehicle))),
             route=Categorical(len(ROUTES), shape=(*batch, 1), dtype=torch.int64),
             **{name: flag.clone() for name in OUTCOMES},
             shape=batch,

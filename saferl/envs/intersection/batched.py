@@ -141,19 +141,19 @@ def look(scenario: Scenario, state: State) -> tuple[State, Tensor]:
     """What is seen in a state.
 
     Returns:
-        ``seen_ego`` [B, 9] and ``seen_vehicles`` [B, M, 6], the observation as it is sensed, and
-        ``within_view`` [B, N], which vehicles are truly observable; and the true ``ego`` [B, 9].
+        ``seen_ego`` [B, F] and ``seen_vehicles`` [B, M, G], the observation as it is sensed, and
+        ``within_view`` [B, N], which vehicles are truly observable; and the true ``ego`` [B, F].
     """
     vehicles = vehicles_of(state)
     others = vehicle_states(vehicles, _lanes(state, _LANE))
-    ego, route, rows = state["ego"], state["route"], scenario.rows
+    ego, route, how = state["ego"], state["route"], (scenario.rows, scenario.observation)
     present = state[_VEHICLE + "present"]
-    own, table, within_view = observe(ego, others, present, route, rows)
+    own, table, within_view = observe(ego, others, present, route, *how)
     seen = own, table
     if not scenario.traffic.sensed_exactly:
         slot = torch.arange(len(vehicles.s), device=others.device)
         sensed = sense(scenario.traffic, others, present, slot, state["seed"], state["steps"])
-        seen = observe(ego, *sensed, route, rows)
+        seen = observe(ego, *sensed, route, *how)
     view = {"seen_ego": seen[0], "seen_vehicles": seen[1], "within_view": within_view}
     return view, own
 
@@ -207,9 +207,10 @@ def advance(scenario: Scenario, state: State, action: Tensor) -> tuple[State, St
     seen, own = look(scenario, after)
     after |= seen
     off = offroad(ego)
+    cost = cost + scenario.cost.crash * (off | collision)
     success = arrived(ego, route) & ~off & ~collision
     reward = scenario.reward(
-        ego, route, control, previous, own[:, 7], own[:, 8], seen["within_view"].any(-1),
+        ego, route, control, previous, own[:, -2], own[:, -1], seen["within_view"].any(-1),
         off | collision, success,
     )  # fmt: skip
     terminated = off | collision | success
@@ -244,7 +245,7 @@ class BatchedIntersection(IntersectionBase):
 
     >>> env = BatchedIntersection(Scenario(task="lt"), num_envs=3)
     >>> env.rollout(4)["next", "vehicles"].shape
-    torch.Size([3, 4, 11, 6])
+    torch.Size([3, 4, 11, 13])
     """
 
     def __init__(

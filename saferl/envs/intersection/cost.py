@@ -28,6 +28,8 @@ class CollisionCost:
         decay: w.
         base_speed: m/s.
         initial: C_init.
+        crash: what a collision or leaving the road adds (ours); the paper charges predictions alone, and an
+            episode that a crash has ended costs no more.
 
     >>> ego = torch.tensor([0., 0., 9., 0., 0., 0.])
     >>> ahead = torch.tensor([[5.5, 0., 0., 0., 0., 0.]])  # a standing car, half a metre ahead
@@ -44,13 +46,15 @@ class CollisionCost:
     decay: float = 1.0
     base_speed: float = 9.0
     initial: float = 0.05
+    crash: float = 0.0
 
     def __post_init__(self):
         for name in ("steps", "dt", "base_speed"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"cost.{name} must be > 0, got {getattr(self, name)}.")
-        if self.initial < 0:
-            raise ValueError(f"cost.initial must be >= 0, got {self.initial}.")
+        for name in ("initial", "crash"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"cost.{name} must be >= 0, got {getattr(self, name)}.")
         if len(self.growth) != 2 or not 0 < self.growth[0] <= self.growth[1]:
             raise ValueError(
                 f"cost.growth must be 2 numbers with 0 < first <= last, got {self.growth}."

@@ -15,6 +15,7 @@ from saferl.envs.intersection.geometry import (
     reference_lines,
     wrap,
 )
+from saferl.envs.intersection.observation import as_world
 from saferl.envs.intersection.traffic import STOP
 from saferl.envs.seeding import mix, uniform
 
@@ -32,7 +33,7 @@ class Driver(TensorDictModuleBase):
     Args:
         speed: m/s.
 
-    Reads ``ego`` [*B, 9] and ``route`` [*B, 1] (and ``vehicles`` [*B, M, 6] in subclasses). Writes
+    Reads ``ego`` [*B, F], ``vehicles`` [*B, M, G] and ``route`` [*B, 1], of either form. Writes
     ``action`` [*B, 2] in [-1, 1].
 
     >>> from saferl.envs.intersection import BatchedIntersection, Scenario
@@ -59,11 +60,12 @@ class Driver(TensorDictModuleBase):
         return torch.where(near, limit, self.speed).amin(-1).clamp_max(self.speed)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        ego, route = tensordict["ego"], tensordict["route"].squeeze(-1)
+        route = tensordict["route"].squeeze(-1)
+        ego, vehicles = as_world(tensordict["ego"], tensordict["vehicles"])
         line = reference_lines(route, ego)[..., 0, :, :]
         _, s, _ = project(ego[..., 1:3], line)
         v = ego[..., 3]
-        target = self.target_speed(ego, tensordict["vehicles"], line, s)
+        target = self.target_speed(ego, vehicles, line, s)
         aim = line_pose(line, s + 2.0 + 0.5 * v)
         dx, dy = aim[..., 0] - ego[..., 1], aim[..., 1] - ego[..., 2]
         bearing = wrap(torch.atan2(dy, dx) - ego[..., 5])
@@ -156,3 +158,23 @@ class RandomDriver(Driver):
             key = mix(key ^ number, 0)
         action = torch.stack([uniform(key, 0), uniform(key, 1)], -1)
         return tensordict.set("action", (2 * action - 1).to(ego.dtype))
+
+
+#: Scripted drivers by the names that commands give them.
+DRIVERS = {"random": RandomDriver, "blind": Driver, "scripted": CautiousDriver}
+
+
+def driver(name: str, seed: int = 0) -> Driver:
+    """A scripted driver by its name; ``seed`` is the random one's.
+
+    Raises:
+        ValueError: there is none of this name.
+
+    >>> driver("cautious")
+    Traceback (most recent call last):
+    ...
+    ValueError: policy must be one of random, blind, scripted, got 'cautious'.
+    """
+    if name not in DRIVERS:
+        raise ValueError(f"policy must be one of {', '.join(DRIVERS)}, got {name!r}.")
+    return RandomDriver(seed) if name == "random" else DRIVERS[name]()

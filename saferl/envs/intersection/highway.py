@@ -40,7 +40,7 @@ from saferl.envs.intersection.vehicles import EgoVehicle
 class IntersectionEnv(gymnasium.Env):
     """Drive the ego through an unsignalised intersection with up to ten other vehicles.
 
-    The observation is a dict of ``ego`` [9] and ``vehicles`` [rows, 6] (:func:`observe`, SI units),
+    The observation is a dict of ``ego`` [F] and ``vehicles`` [rows, G] (:func:`observe`, SI units),
     the action [2] in [-1, 1] is (a_x / 5 m/s^2, delta_f / 0.6 rad). ``info`` holds ``cost``
     (Algorithm 2 on the state before the step and the executed action; 0.0 at reset), the outcomes
     ``collision``, ``offroad``, ``success``, and ``route`` and ``task``.
@@ -50,7 +50,7 @@ class IntersectionEnv(gymnasium.Env):
     in :data:`ROUTES`) and ``start`` (the ego's state [6]).
 
     Args:
-        task, vehicles, scenario, traffic, rows, policy_frequency, duration, route_starts, standstill:
+        task, vehicles, scenario, traffic, rows, observation, policy_frequency, duration, route_starts, standstill:
             see :class:`Scenario`.
         reward: a :class:`Reward` or its fields, e.g. ``{"reading": "raw", "risk_shaping": True}``.
         cost: a :class:`CollisionCost` or its fields.
@@ -59,7 +59,7 @@ class IntersectionEnv(gymnasium.Env):
     >>> env = IntersectionEnv(task="lt")
     >>> observation, info = env.reset(seed=0)
     >>> observation["vehicles"].shape, info["success"]
-    ((11, 6), False)
+    ((11, 13), False)
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012
@@ -71,6 +71,7 @@ class IntersectionEnv(gymnasium.Env):
         scenario: str = "nominal",
         traffic: Traffic | Mapping[str, Any] | None = None,
         rows: int = ROWS,
+        observation: str = "route",
         policy_frequency: int = 5,
         duration: float = 25.0,
         route_starts: float = 0.0,
@@ -82,7 +83,7 @@ class IntersectionEnv(gymnasium.Env):
         settings: Any = traffic or {}
         self.scenario = Scenario(
             task=task, vehicles=vehicles, scenario=scenario, traffic=settings, rows=rows,
-            policy_frequency=policy_frequency, duration=duration, route_starts=route_starts,
+            observation=observation, policy_frequency=policy_frequency, duration=duration, route_starts=route_starts,
             standstill=standstill, reward=build("reward", Reward(), reward or {}),
             cost=build("cost", CollisionCost(), cost or {}),
         )  # fmt: skip
@@ -93,11 +94,12 @@ class IntersectionEnv(gymnasium.Env):
             )
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": policy_frequency}
+        form = self.scenario.form
         unbounded = {"low": -np.inf, "high": np.inf, "dtype": np.float32}
         self.observation_space = spaces.Dict(
             {
-                "ego": spaces.Box(shape=(9,), **unbounded),
-                "vehicles": spaces.Box(shape=(rows, 6), **unbounded),
+                "ego": spaces.Box(shape=(len(form.ego),), **unbounded),
+                "vehicles": spaces.Box(shape=(rows, len(form.vehicle)), **unbounded),
             }
         )
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -156,14 +158,13 @@ class IntersectionEnv(gymnasium.Env):
         scenario, state = self.scenario, self.ego.state
         self._vehicles = others = torch.from_numpy(self.road.states())
         present = torch.ones(len(others), dtype=torch.bool)
-        self._own, table, self._observed = observe(
-            state, others, present, self._route, scenario.rows
-        )
+        how = scenario.rows, scenario.observation
+        self._own, table, self._observed = observe(state, others, present, self._route, *how)
         own = self._own
         if not scenario.traffic.sensed_exactly:
             slot, steps = torch.from_numpy(self.road.slot), torch.tensor(self._steps)
             sensed = sense(scenario.traffic, others, present, slot, self._seed, steps)
-            own, table, _ = observe(state, *sensed, self._route, scenario.rows)
+            own, table, _ = observe(state, *sensed, self._route, *how)
         return {"ego": own.float().numpy(), "vehicles": table.float().numpy()}
 
     def _respawn(self) -> None:
@@ -219,9 +220,10 @@ class IntersectionEnv(gymnasium.Env):
         self._control, self._steps = control, self._steps + 1
         observation = self._observe()
         off = bool(offroad(ego.state))
+        cost += scenario.cost.crash * (off or collision)
         success = not (collision or off) and bool(arrived(ego.state, self._route))
         reward = scenario.reward(
-            ego.state, self._route, control, previous, self._own[7], self._own[8],
+            ego.state, self._route, control, previous, self._own[-2], self._own[-1],
             self._observed.any(), torch.tensor(collision or off), torch.tensor(success),
         )  # fmt: skip
         terminated = collision or off or success
