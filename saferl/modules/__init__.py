@@ -15,6 +15,7 @@ from saferl.modules.mmam import EGO_SCALE, VEHICLE_SCALE, MMAMPolicyEncoder, MMA
 from saferl.modules.plain import PlainMMAMPolicyEncoder, PlainMMAMValue
 from saferl.modules.projection import ProjectionResult, project
 from saferl.modules.risk import CVaR, Largest, MeanStd
+from saferl.modules.sets import SetPolicyEncoder, SetValue
 
 __all__ = [
     "EGO_SCALE",
@@ -35,6 +36,8 @@ __all__ = [
     "PlainMMAMPolicyEncoder",
     "PlainMMAMValue",
     "ProjectionResult",
+    "SetPolicyEncoder",
+    "SetValue",
     "StateValue",
     "compiled",
     "project",

@@ -21,8 +21,12 @@ class GaussianHead(nn.Module):
         width: size of these features.
         action_dim: A, size of the action.
         scale_lb: smallest standard deviation before the tanh.
+        scale_init: the one that the policy begins with, about.
 
-    Returns ``loc`` and ``scale``, each [*B, A]; the scale is 1 where the map gives 0.
+    Returns ``loc`` and ``scale``, each [*B, A]; the scale is ``scale_init`` where the map gives 0.
+
+    Raises:
+        ValueError: ``scale_init`` is not above ``scale_lb``.
 
     Examples:
         >>> import torch
@@ -32,11 +36,21 @@ class GaussianHead(nn.Module):
         (torch.Size([4, 2]), True)
     """
 
-    def __init__(self, encoder: nn.Module, width: int, action_dim: int = 2, scale_lb: float = 1e-4):
+    def __init__(
+        self,
+        encoder: nn.Module,
+        width: int,
+        action_dim: int = 2,
+        scale_lb: float = 1e-4,
+        scale_init: float = 1.0,
+    ):
         super().__init__()
+        if not scale_init > scale_lb:
+            raise ValueError(f"scale_init must be > scale_lb={scale_lb}, got {scale_init}.")
         self.encoder = encoder
         self.head = nn.Linear(width, 2 * action_dim)
-        self.extract = NormalParamExtractor(scale_lb=scale_lb)  # pyright: ignore[reportArgumentType]
+        mapping = f"biased_softplus_{scale_init}"
+        self.extract = NormalParamExtractor(mapping, scale_lb=scale_lb)  # pyright: ignore[reportArgumentType]
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         return self.extract(self.head(self.encoder(*inputs)))
@@ -49,6 +63,7 @@ def tanh_gaussian_actor(
     in_keys: Sequence[NestedKey] = ("ego", "vehicles"),
     *,
     scale_lb: float = 1e-4,
+    scale_init: float = 1.0,
 ) -> ProbabilisticActor:
     """A tanh-squashed Gaussian policy, as soft actor-critic needs (Haarnoja et al., 2018).
 
@@ -62,6 +77,7 @@ def tanh_gaussian_actor(
         action_dim: A, size of the action.
         in_keys: entries that the encoder takes, in its order.
         scale_lb: smallest standard deviation before the tanh.
+        scale_init: the one that the policy begins with, about.
 
     Reads ``in_keys``. Writes ``loc``, ``scale`` and ``action`` [*B, A], ``action_log_prob`` [*B].
 
@@ -74,7 +90,7 @@ def tanh_gaussian_actor(
         >>> actor(td)["action"].shape, td["action_log_prob"].shape
         (torch.Size([5, 2]), torch.Size([5]))
     """
-    head = GaussianHead(encoder, width, action_dim, scale_lb)
+    head = GaussianHead(encoder, width, action_dim, scale_lb, scale_init)
     return ProbabilisticActor(
         TensorDictModule(head, in_keys=list(in_keys), out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],

@@ -111,11 +111,22 @@ class MLPPolicyEncoder(nn.Module):
         vehicle_scale: Sequence[float] = VEHICLE_SCALE,
         size: int | None = None,
     ):
-        super().__init__()
+        scene = _front(size, rows, ego_scale, vehicle_scale)
+        keys = ("ego", "vehicles") if size is None else ("observation",)
+        self._build(scene, keys, width, depth, activation)
+
+    def _build(
+        self,
+        scene: Any,
+        in_keys: tuple[str, ...],
+        width: int,
+        depth: int,
+        activation: type[nn.Module],
+    ) -> None:
         check_sizes(width=width, depth=depth)
-        self.scene = _front(size, rows, ego_scale, vehicle_scale)
-        self.in_keys = ("ego", "vehicles") if size is None else ("observation",)
-        self.layers = _hidden(self.scene.size, width, depth, activation)
+        super().__init__()
+        self.scene, self.in_keys = scene, in_keys
+        self.layers = _hidden(scene.size, width, depth, activation)
 
     def forward(self, *observed: Tensor) -> Tensor:
         return self.layers(self.scene(*observed))
@@ -163,11 +174,25 @@ class MLPValue(nn.Module):
         outputs: int = 1,
         layer_norm: bool = False,
     ):
-        super().__init__()
+        scene = _front(size, rows, ego_scale, vehicle_scale)
+        keys = ("ego", "vehicles") if size is None else ("observation",)
+        self._build(scene, keys, width, depth, action_dim, activation, outputs, layer_norm)
+
+    def _build(
+        self,
+        scene: Any,
+        in_keys: tuple[str, ...],
+        width: int,
+        depth: int,
+        action_dim: int,
+        activation: type[nn.Module],
+        outputs: int,
+        layer_norm: bool,
+    ) -> None:
         check_sizes(width=width, depth=depth, action_dim=action_dim, outputs=outputs)
-        self.scene = _front(size, rows, ego_scale, vehicle_scale)
-        self.in_keys = ("ego", "vehicles") if size is None else ("observation",)
-        self.first = nn.Linear(self.scene.size + action_dim, width)
+        super().__init__()
+        self.scene, self.in_keys = scene, in_keys
+        self.first = nn.Linear(scene.size + action_dim, width)
         self.activation = activation()
         sizes = [width] * (depth - 1) + [outputs]
         self.layers = nn.ModuleList(nn.Linear(width, size) for size in sizes)

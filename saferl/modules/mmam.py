@@ -50,7 +50,7 @@ def scale_vehicles(vehicles: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(present.unsqueeze(-1), vehicles / scale, 0.0), present
 
 
-def _linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+def flat_linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
     """``F.linear`` of [*B, F] as of [N, F].
 
     With stacked weights, vmap turns a linear map of three or more dimensions into a product with
@@ -62,7 +62,7 @@ def _linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
 
 class _Linear(nn.Linear):
     def forward(self, input: Tensor) -> Tensor:
-        return _linear(input, self.weight, self.bias)
+        return flat_linear(input, self.weight, self.bias)
 
 
 class _SceneTokens(nn.Module):
@@ -331,15 +331,15 @@ class MMAMValue(nn.Module):
         share = share / share.sum(-2, keepdim=True).clamp(min=1.0)
         # A layer on concatenated tokens is a sum of one product for each of them.
         on_ego, joint_on_action, on_pooled = self.joint.weight.tensor_split([width, 2 * width], -1)
-        joint = _linear(ego_token, on_ego, self.joint.bias)
-        scene = {"query": query, "logits": logits, "readings": _linear(tokens, readout).mT}
+        joint = flat_linear(ego_token, on_ego, self.joint.bias)
+        scene = {"query": query, "logits": logits, "readings": flat_linear(tokens, readout).mT}
         on_token = [readout, joint_on_action]
         if self.pair is None:
-            joint = joint + _linear((vehicle_tokens * share).sum(-2), on_pooled)
+            joint = joint + flat_linear((vehicle_tokens * share).sum(-2), on_pooled)
         else:
             on_vehicle, on_ego, pair_on_action = self.pair.weight.split(width, dim=-1)
-            pair = _linear(vehicle_tokens, on_vehicle, self.pair.bias)
-            pair = pair + _linear(ego_token, on_ego).unsqueeze(-2)
+            pair = flat_linear(vehicle_tokens, on_vehicle, self.pair.bias)
+            pair = pair + flat_linear(ego_token, on_ego).unsqueeze(-2)
             scene |= {"pair": pair, "share": share, "joint_on_pooled": on_pooled}
             on_token.append(pair_on_action)
         scene |= {"joint": joint, "on_token": torch.cat(on_token)}
@@ -348,12 +348,12 @@ class MMAMValue(nn.Module):
 
     def value(self, scene: dict[str, Any], action: Tensor) -> Tensor:
         """The value of ``action`` [*B, A] in the states of ``scene``, [*B, K]."""
-        token = F.gelu(_linear(action, *scene["action"]))
+        token = F.gelu(flat_linear(action, *scene["action"]))
         logit = (scene["query"] @ token.unsqueeze(-1)).squeeze(-1)
         weights = torch.cat([scene["logits"], logit.unsqueeze(-1)], dim=-1).softmax(-1)
         heads, width = scene["query"].shape[-2:]
         # All that reads the action's token reads it in one product.
-        read = _linear(token, scene["on_token"]).tensor_split([heads, heads + width], dim=-1)
+        read = flat_linear(token, scene["on_token"]).tensor_split([heads, heads + width], dim=-1)
         reading, on_joint, on_pair = read
         y_attn = (weights[..., :-1] * scene["readings"]).sum((-2, -1))
         y_attn = y_attn + (weights[..., -1] * reading).sum(-1)
@@ -361,10 +361,10 @@ class MMAMValue(nn.Module):
         if "pair" in scene:
             pairs = F.gelu(scene["pair"] + on_pair.unsqueeze(-2))
             pooled = (pairs * scene["share"]).sum(-2)
-            y_mlp = y_mlp + _linear(pooled, scene["joint_on_pooled"])
+            y_mlp = y_mlp + flat_linear(pooled, scene["joint_on_pooled"])
         for weight, bias in scene["layers"]:
-            y_mlp = _linear(self._activate(y_mlp), weight, bias)
-        return y_attn.unsqueeze(-1) + _linear(self._activate(y_mlp), scene["w_mlp"])
+            y_mlp = flat_linear(self._activate(y_mlp), weight, bias)
+        return y_attn.unsqueeze(-1) + flat_linear(self._activate(y_mlp), scene["w_mlp"])
 
     def forward(self, ego: Tensor, vehicles: Tensor, action: Tensor) -> Tensor:
         return self.value(self.encode(ego, vehicles), action)
