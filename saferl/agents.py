@@ -16,6 +16,7 @@ from torchrl.objectives import LossModule, ValueEstimators
 
 from saferl.checkpoint import latest, load_component, run_config
 from saferl.components import Fitting, Networks
+from saferl.envs.intersection.observation import FORMS
 from saferl.envs.transforms import SafetyProjector
 from saferl.modules import (
     CVaR,
@@ -26,6 +27,7 @@ from saferl.modules import (
     value_operator,
     zero_output,
 )
+from saferl.validation import arguments
 
 #: Options of a critic of action values, and what they are where nothing is said.
 USUAL = {"outputs": 1, "layer_norm": False}
@@ -90,6 +92,20 @@ def observed(cfg: DictConfig) -> tuple[str, ...]:
     return ("observation",) if "size" in cfg.task else ("ego", "vehicles")
 
 
+def _scales(cfg: DictConfig, network: str) -> dict[str, tuple[float, ...]]:
+    """The scales of what is observed, and with them its sizes, as far as a network takes them and its
+    configuration says none."""
+    if "observation" not in cfg.task:
+        return {}
+    node, scales = cfg.encoder[network], FORMS[cfg.task.observation].scales
+    accepted = arguments(node._target_)
+    return {
+        key: value
+        for key, value in scales.items()
+        if key not in node and (accepted is None or key in accepted)
+    }
+
+
 def _takes(cfg: DictConfig) -> set[str]:
     """Names of what the configured loss is built from."""
     return set(inspect.signature(hydra.utils.get_object(cfg.loss._target_)).parameters)
@@ -112,10 +128,12 @@ def _check_parts(cfg: DictConfig) -> None:
             raise ValueError(f"{loss} takes no {name}: set {name}=none, or another loss.")
         if name in takes and not present:
             raise ValueError(f"{loss} needs {name}, got {name}=none.")
-    if cfg.projector._target_ is not None and (fresh or "cost_critic" not in takes):
+    # Of the action values: those of on-policy losses are for a projector alone.
+    has_risk = "risk_critic" in takes or (not fresh and "cost_critic" in takes)
+    if cfg.projector._target_ is not None and not has_risk:
         raise ValueError(
             f"projector needs cost critics Q_c(s, a), which {loss} has not: "
-            "set projector=none, or loss=sac_lag."
+            "set projector=none, or loss=sac_lag or ppo_risk."
         )
     risk = hydra.utils.get_object(cfg.risk._target_)
 
@@ -136,8 +154,8 @@ def _check_parts(cfg: DictConfig) -> None:
             f"got cost_backup={cfg.cost_backup}."
         )
     for name in ("critic", "cost_critic"):
-        if not fresh:
-            break
+        if not fresh or (name == "cost_critic" and "risk_critic" in takes):
+            continue
         if cfg[name].members > 1:
             raise ValueError(
                 f"{loss} has one state value: set {name}=single, got {cfg[name].members} members."
@@ -160,13 +178,15 @@ def build_agent(cfg: DictConfig) -> Agent:
     width, action_dim = cfg.encoder.policy.width, cfg.task.get("action_dim", 2)
 
     def policy_encoder() -> torch.nn.Module:
-        return hydra.utils.instantiate(cfg.encoder.policy)
+        return hydra.utils.instantiate(cfg.encoder.policy, **_scales(cfg, "policy"))
 
     def action_values(critics: DictConfig) -> list[torch.nn.Module]:
         # Only what differs, so that an encoder need not know of options that it is not asked for.
         options = {k: v for k, v in _critic_options(critics).items() if v != USUAL[k]}
         return [
-            hydra.utils.instantiate(cfg.encoder.value, **options).to(device)
+            hydra.utils.instantiate(cfg.encoder.value, **_scales(cfg, "value"), **options).to(
+                device
+            )
             for _ in range(critics.members)
         ]
 
@@ -181,9 +201,7 @@ def build_agent(cfg: DictConfig) -> Agent:
         # Of a list of one TorchRL makes parameters that no optimizer sees.
         return members[0] if len(members) == 1 else members
 
-    def cost_critic() -> Any:
-        if on_policy(cfg):
-            return state_value("state_cost_value")
+    def risk_critic() -> Any:
         # At 0, or a projector would correct every action before the first cost was seen.
         return alone_or_all(
             [
@@ -192,6 +210,9 @@ def build_agent(cfg: DictConfig) -> Agent:
             ]
         )
 
+    def cost_critic() -> Any:
+        return state_value("state_cost_value") if on_policy(cfg) else risk_critic()
+
     encoder = policy_encoder()
     wanted: Any = encoder.in_keys
     if tuple(wanted) != keys:
@@ -199,7 +220,9 @@ def build_agent(cfg: DictConfig) -> Agent:
             f"{cfg.encoder.policy._target_} reads {', '.join(wanted)}, but task={cfg.task.task} observes "
             f"{', '.join(keys)}: set encoder=mlp, or an algorithm without attention (rsac, sac, ...)."
         )
-    actor = tanh_gaussian_actor(encoder, width, action_dim, keys).to(device)
+    actor = tanh_gaussian_actor(
+        encoder, width, action_dim, keys, scale_init=cfg.get("initial_std", 1.0)
+    ).to(device)
     parts = {
         "actor_network": lambda: actor,
         "qvalue_network": lambda: alone_or_all(
@@ -208,6 +231,7 @@ def build_agent(cfg: DictConfig) -> Agent:
         "num_qvalue_nets": lambda: cfg.critic.members,
         "critic_network": lambda: state_value("state_value"),
         "cost_critic": cost_critic,
+        "risk_critic": risk_critic,
         "num_cost_critics": lambda: cfg.cost_critic.members,
         "lagrange": lambda: hydra.utils.instantiate(cfg.lagrange.multiplier),
         "target_entropy": lambda: cfg.target_entropy,
@@ -239,7 +263,7 @@ def load_agent(cfg: DictConfig, path: Path, name: str) -> Agent:
 def _architecture(cfg: DictConfig) -> dict[str, Any]:
     """What decides whether the networks of two configurations fit, by option."""
     options = {f"task.{key}": cfg.task.get(key) for key in ("rows", "size", "action_dim")}
-    fresh = on_policy(cfg)
+    fresh = on_policy(cfg) and "risk_critic" not in _takes(cfg)
     for network in ("policy",) if fresh else ("policy", "value"):
         for key, value in cfg.encoder[network].items():
             if key not in ("rows", "size"):  # the task

@@ -178,7 +178,13 @@ class Networks(Fitting):
 
     NAMES = frozenset(
         f"{target}{network}_params"
-        for network in ("actor_network", "qvalue_network", "critic_network", "cost_critic")
+        for network in (
+            "actor_network",
+            "qvalue_network",
+            "critic_network",
+            "cost_critic",
+            "risk_critic",
+        )
         for target in ("", "target_")
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from saferl.objectives.cpo import CPOLoss
-from saferl.objectives.ppo import PPOLagLoss
+from saferl.objectives.ppo import PPOLagLoss, RiskPPOLoss
 from saferl.objectives.sac import SACLagLoss
 
-__all__ = ["CPOLoss", "PPOLagLoss", "SACLagLoss"]
+__all__ = ["CPOLoss", "PPOLagLoss", "RiskPPOLoss", "SACLagLoss"]

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
 from tensordict.utils import NestedKey
+from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.utils import distance_loss
 
-from saferl.modules import LagrangeMultiplier
+from saferl.modules import BoundCritics, CriticEnsemble, LagrangeMultiplier, Largest
 from saferl.objectives.advantages import CostValueLoss
-from saferl.objectives.checks import check_begun, check_lagrange
+from saferl.objectives.checks import check_begun, check_lagrange, count_members
 
 
 @dataclass
@@ -151,3 +154,143 @@ class PPOLagLoss(CostValueLoss, ClipPPOLoss):
         out.set("lagrange_multiplier", self.lagrange.value.detach().clone())
         self._clear_weakrefs(tensordict, out, "cost_critic_params", "target_cost_critic_params")
         return out
+
+
+@dataclass
+class RiskKeys(CostKeys):
+    """Keys that ``set_keys`` accepts beside those of :class:`PPOLagLoss`.
+
+    Attributes:
+        action_executed: the action that the environment got; where a batch has none, the policy's own.
+        state_action_cost_value: what the risk critics write.
+    """
+
+    action_executed: NestedKey = ("next", "action_executed")
+    state_action_cost_value: NestedKey = "state_action_cost_value"
+
+
+class RiskPPOLoss(PPOLagLoss):
+    r"""PPO-Lagrangian that also learns :math:`Q_c(s, a)`, the risk that a projector needs.
+
+    .. math::
+
+        L = L_{PPO-Lag} + E\Big[\sum_i \tfrac12 (Q_{c,i}(s, \bar a) - G_c)^2\Big]
+
+    with :math:`\bar a` the action that was executed and :math:`G_c` the cost's value target, the TD(lambda) return
+    that followed it. The policy's own terms keep the action that it proposed, whose log-probability it knows; the
+    correction is a part of what it acts on.
+
+    Args:
+        actor_network, critic_network, cost_critic: as in :class:`PPOLagLoss`.
+        risk_critic (list of TensorDictModule): the members of Q_c(s, a), at least two; write
+            ``"state_action_cost_value"``.
+
+    Keyword Args:
+        risk (callable, optional): what :attr:`cost_value` makes of the members' values ``[n, *B, 1]``. Defaults to
+            :class:`~saferl.modules.Largest`.
+        **settings: as in :class:`PPOLagLoss`.
+
+    Reads as :class:`PPOLagLoss`, and ``("next", "action_executed")`` ``[*B, A]`` where a projector wrote it.
+    Writes besides ``"loss_risk"``.
+
+    Raises:
+        ValueError: as :class:`PPOLagLoss`; fewer than two members.
+
+    Examples:
+        >>> from saferl.modules import (
+        ...     DualAscent, MLPPolicyEncoder, MLPValue, StateValue, tanh_gaussian_actor, value_operator
+        ... )
+        >>> from saferl.objectives import RiskPPOLoss
+        >>> def value(key):
+        ...     network = StateValue(MLPPolicyEncoder(rows=3, width=16), width=16)
+        ...     return value_operator(network, in_keys=("ego", "vehicles"), out_key=key)
+        >>> members = [
+        ...     value_operator(MLPValue(rows=3, width=16), out_key="state_action_cost_value")
+        ...     for _ in range(2)
+        ... ]
+        >>> actor = tanh_gaussian_actor(MLPPolicyEncoder(rows=3, width=16), width=16)
+        >>> values = value("state_value"), value("state_cost_value")
+        >>> loss = RiskPPOLoss(actor, *values, members, lagrange=DualAscent())
+        >>> loss.cost_value.out_keys
+        ['state_action_cost_value']
+    """
+
+    _AcceptedKeys = RiskKeys
+    default_keys = RiskKeys
+
+    risk_critic: TensorDictModule
+    risk_critic_params: TensorDictParams
+    target_risk_critic_params: TensorDictParams
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential,
+        critic_network: TensorDictModule,
+        cost_critic: TensorDictModule,
+        risk_critic: list[TensorDictModule],
+        *,
+        lagrange: LagrangeMultiplier,
+        risk: Callable[[Tensor], Tensor] | None = None,
+        clip_epsilon: float = 0.2,
+        entropy_bonus: bool = False,
+        entropy_coeff: float = 0.01,
+        critic_coeff: float = 1.0,
+        clip_value: bool | float = False,
+        loss_critic_type: Literal["l1", "l2", "smooth_l1"] = "l2",
+        normalize_advantage: bool = True,
+        separate_losses: bool = False,
+        reduction: Literal["none", "mean", "sum"] | None = None,
+    ) -> None:
+        count = count_members("risk_critic", risk_critic, "", None)
+        super().__init__(
+            actor_network,
+            critic_network,
+            cost_critic,
+            lagrange=lagrange,
+            clip_epsilon=clip_epsilon,
+            entropy_bonus=entropy_bonus,
+            entropy_coeff=entropy_coeff,
+            critic_coeff=critic_coeff,
+            clip_value=clip_value,
+            loss_critic_type=loss_critic_type,
+            normalize_advantage=normalize_advantage,
+            separate_losses=separate_losses,
+            reduction=reduction,
+        )
+        self.risk = risk or Largest()
+        self.convert_to_functional(risk_critic, "risk_critic", count)  # pyright: ignore
+        self.out_keys = [*self.out_keys, "loss_risk"]
+
+    @property
+    def cost_value(self) -> CriticEnsemble:
+        """The risk of the members' values, on their live parameters, as :attr:`SACLagLoss.cost_value`."""
+        return CriticEnsemble(
+            self.risk_critic,
+            params=self.risk_critic_params,
+            reduce=self.risk,
+            action_key=self.tensor_keys.action,
+        )
+
+    @dispatch()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        out = PPOLagLoss.forward(self, tensordict)
+        out.set("loss_risk", self.risk_loss(tensordict))
+        self._clear_weakrefs(tensordict, out, "risk_critic_params", "target_risk_critic_params")
+        return out
+
+    def risk_loss(self, tensordict: TensorDictBase) -> Tensor:
+        """Half the squared error of each Q_c(s, a) against ``"cost_value_target"``, summed and reduced.
+
+        Args:
+            tensordict: ``[*B]`` as :meth:`begin` leaves it.
+        """
+        keys = self.tensor_keys
+        check_begun(tensordict, keys.cost_value_target)
+        action = tensordict.get(keys.action_executed, tensordict.get(keys.action))
+        critics = BoundCritics.of(
+            self.risk_critic, self.risk_critic_params, tensordict, action_key=keys.action
+        )
+        predicted = critics.values(action)
+        target = tensordict.get(keys.cost_value_target).expand_as(predicted)
+        loss = 0.5 * distance_loss(predicted, target, loss_function="l2").sum(0).squeeze(-1)
+        return self._reduce_loss(loss, tensordict)
