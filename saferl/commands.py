@@ -23,16 +23,15 @@ from saferl.agents import load_agent
 from saferl.builders import build_env, build_trainer, complete
 from saferl.checkpoint import CONFIG, run_config, run_folder
 from saferl.envs.intersection import Scenario
-from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver
+from saferl.envs.intersection.drivers import driver
 from saferl.evaluation import TEST, as_test, envs_at_once, write
 from saferl.evaluation import evaluate as play_episodes
-from saferl.metrics import table
+from saferl.metrics import comparison, summarise, table
 from saferl.paths import pretrained_run
 from saferl.progress import Budget
 from saferl.validation import check_testing
 
 log = logging.getLogger(__name__)
-DRIVERS = {"random": RandomDriver, "blind": Driver, "scripted": CautiousDriver}
 
 
 def train(cfg: DictConfig) -> None:
@@ -62,23 +61,61 @@ def train(cfg: DictConfig) -> None:
         if not resuming and not (run / checkpoint.FOLDER).exists():  # it never began
             (run / CONFIG).unlink(missing_ok=True)
 
-    settings = cfg.evaluation
     cfg = compiling(cfg, False)  # the closing test is over before compiling would pay
     try:
-        measure(
-            cfg,
-            as_test(hydra.utils.instantiate(cfg.task), settings.policy_frequency),
-            *trained_policy(cfg, run),
-            out=run / "evaluation",
-            num_envs=settings.num_envs,
-            episodes=settings.episodes,
-            seed=cfg.seed,
-            policy_name=cfg.algo_name,
-        )
+        closing_test(cfg, run)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"Interrupted in the closing test. Repeat it with resume={run}"
         ) from None
+
+
+def closing_test(cfg: DictConfig, run: Path) -> None:
+    """Test what a run has learned, beside the scripted drivers that it names, and draw its first episodes."""
+    settings = cfg.evaluation
+    scenario = as_test(hydra.utils.instantiate(cfg.task), settings.policy_frequency)
+    policy, transforms = trained_policy(cfg, run)
+
+    def test(policy: TensorDictModuleBase, transforms: Sequence[Transform], name: str, out: Path):
+        return measure(
+            cfg,
+            scenario,
+            policy,
+            transforms,
+            out=out,
+            num_envs=settings.num_envs,
+            episodes=settings.episodes,
+            seed=cfg.seed,
+            policy_name=name,
+        )
+
+    out = run / "evaluation"
+    results = {cfg.algo_name: test(policy, transforms, cfg.algo_name, out)}
+    for name in settings.drivers:
+        results[name] = test(driver(name, cfg.seed), [], name, out / name)
+    if settings.drivers:
+        title = f"The same {settings.episodes} episodes of {scenario.task}"
+        figures = {name: summarise(rows) for name, rows in results.items()}
+        log.info("\n%s", comparison(figures, title))
+    pictures(cfg, scenario, policy, transforms, results[cfg.algo_name][: settings.gif], out)
+
+
+def pictures(
+    cfg: DictConfig,
+    scenario: Any,
+    policy: TensorDictModuleBase,
+    transforms: Sequence[Transform],
+    rows: list[dict],
+    out: Path,
+) -> None:
+    """An animation and a figure of each of these episodes of a test."""
+    if not rows:
+        return
+    from saferl.plotting import draw  # late: few tests want pictures
+
+    env = build_env(cfg, scenario, 1, cfg.seed, *transforms)
+    for row in rows:
+        log.info("%s", draw(policy, env, row, out))
 
 
 def claim(run: Path, cfg: DictConfig) -> None:
@@ -132,12 +169,7 @@ def evaluate(cfg: DictConfig) -> None:
         seed=cfg.seed,
         policy_name=name,
     )
-    if cfg.gif:
-        from saferl.plotting import draw  # late: few tests want pictures
-
-        env = build_env(cfg, scenario, 1, cfg.seed, *transforms)
-        for row in rows[: cfg.gif]:
-            log.info("%s", draw(policy, env, row, out))
+    pictures(cfg, scenario, policy, transforms, rows[: cfg.gif], out)
 
 
 def export(cfg: DictConfig) -> None:
@@ -236,9 +268,7 @@ def choose_policy(
         )
     ((source, name),) = given.items()
     if source == "policy":
-        if name not in DRIVERS:
-            raise ValueError(f"policy must be one of {', '.join(DRIVERS)}, got {name!r}.")
-        return cfg, DRIVERS[name](**({"seed": cfg.seed} if name == "random" else {})), [], name
+        return cfg, driver(name, cfg.seed), [], name
     path = pretrained_run(name) if source == "pretrained" else Path(name)
     trained = run_config(path, source)
     trained.device = cfg.device

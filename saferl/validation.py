@@ -13,6 +13,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import hydra
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from saferl.envs.intersection.drivers import DRIVERS
 from saferl.paths import config_dir
 
 _KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
@@ -36,16 +37,21 @@ TRAINING = {
     "demonstrations": (int, 0, math.inf),
     "updates_per_frame": (float, 0, math.inf),
     "rollout_frames": (int, 1, math.inf),
+    "epochs": (int, 1, math.inf),
     "update_order": (Literal["joint", "sequential"], 0, 0),
     "reward_scale": (float, 0, math.inf),
     "tau": (float, 0, 1),
     "target_entropy": (Literal["auto"] | float, -math.inf, math.inf),
     "alpha_init": (float, 0, math.inf),
+    "initial_std": (float, 0, math.inf),
+    "multiplier_lr": (float, 0, math.inf),
     "record_every": (int, 1, math.inf),
     "save_every": (int, 1, math.inf),
     "save_minutes": (float | None, 0, math.inf),
     "evaluation.episodes": (int, 1, math.inf),
     "evaluation.num_envs": (int, 1, math.inf),
+    "evaluation.drivers": (list[str], 0, 0),
+    "evaluation.gif": (int, 0, math.inf),
     "evaluation.policy_frequency": (int, 1, math.inf),
     "env.num_envs": (int, 1, math.inf),
     "collector.frames_per_env": (int, 1, math.inf),
@@ -58,7 +64,17 @@ TRAINING = {
     "init": (str | None, 0, 0),
     "algo_name": (str, 0, 0),
 }
-POSITIVE = ("updates_per_frame", "reward_scale", "tau", "alpha_init", "save_minutes")
+POSITIVE = (
+    *(
+        "updates_per_frame",
+        "reward_scale",
+        "tau",
+        "alpha_init",
+        "initial_std",
+        "multiplier_lr",
+        "save_minutes",
+    ),
+)
 TESTING = {
     "episodes": (int, 1, math.inf),
     "seed": (int, 0, 2**31 - 1),
@@ -87,6 +103,16 @@ def check_training(cfg: DictConfig) -> None:
         pair = isinstance(rates, ListConfig) and len(rates) == 2
         if not pair or not all(fits(rate, float) and 0 <= rate < math.inf for rate in rates):
             raise ValueError(f"lr.{name} must be [first, last], both >= 0, got {rates!r}.")
+    for name in cfg.evaluation.drivers:
+        if name not in DRIVERS:
+            raise ValueError(
+                f"evaluation.drivers must be among {', '.join(DRIVERS)}, got {name!r}."
+            )
+    for key in ("drivers", "gif"):
+        if cfg.evaluation[key] and "rows" not in cfg.task:
+            raise ValueError(
+                f"evaluation.{key} is of the road, which task={cfg.task.task} has not, got {cfg.evaluation[key]}."
+            )
     for key in ("batch_size", "demonstrations"):
         if cfg.buffer_size < cfg[key]:
             raise ValueError(f"buffer_size must be >= {key}, got {cfg.buffer_size} and {cfg[key]}.")

@@ -64,6 +64,8 @@ def test_of_nothing(arguments: list[str]):
         ["curves", "{out}/curves.png", "ARSAC={run}"],
         ["compare", "{run}/test", "{run}/test"],
         ["ablation", "{out}", "--train", "gs", *ABLATION, "--set", "frames=512", *FAST],
+        ["time_to_safe", "{out}", "--runs", "algo=rsac", "--minutes", "0.2", "--every", "0.1", "--episodes", "4",
+         "--jobs", "1", "--peers", "ours", "intersection-v1", "--set", "frames=512", "env.num_envs=16", *FAST],
         ["updates_per_frame", "{out}", "--values", "0.25", "--minutes", "0.05", "--seeds", "0",
          "--task", "gs", "--set", *FAST],
     ],

@@ -23,9 +23,9 @@ from saferl.trainer import _interrupts
 TRAIN, TEST, EXPORT = ("train", "config"), ("evaluate", "evaluate"), ("export", "export")
 
 MISTAKES = [
-    (TRAIN, "algo=foo", "algo must be one of arsac, arsac_plus, arsac_signed, asac, cpo, ppo, "),
+    (TRAIN, "algo=foo", "algo must be one of arppo, arsac, arsac_plus, arsac_signed, asac, cpo, "),
     (TRAIN, "task=foo", "task must be one of cart, gs, gym, lt, mixed, rt, got 'foo'"),
-    (TRAIN, "encoder=foo", "encoder must be one of mlp, mlp_tanh, mmam, got 'foo'"),
+    (TRAIN, "encoder=foo", "encoder must be one of mlp, mlp_tanh, mmam, set, got 'foo'"),
     (TRAIN, "env=foo", "env must be one of batched, cart, gym, highway, got 'foo'"),
     (TRAIN, "experiment=foo", "quickstart"),
     (TRAIN, "gama=0.9", "unknown key 'gama' (did you mean gamma?); choose from seed, "),
@@ -59,11 +59,20 @@ MISTAKES = [
     (TRAIN, "algo=ppo_rs task=cart", "which task=cart has not: set shaping=none"),
     (TRAIN, "alpha_init=0", "alpha_init must be a number, > 0, got 0"),
     (TRAIN, "evaluation.episodes=0", "evaluation.episodes must be a whole number, >= 1, got 0"),
+    (TRAIN, "evaluation.drivers=[blind,fast]", "must be among random, blind, scripted, got 'fast'"),
+    (
+        TRAIN,
+        "algo=sac task=cart evaluation.gif=1",
+        "evaluation.gif is of the road, which task=cart",
+    ),
+    (TRAIN, "multiplier_lr=0", "multiplier_lr must be a number, > 0, got 0"),
+    (TRAIN, "task.observation=map", "observation must be one of route, world, got 'map'"),
+    (TRAIN, "task.cost.crash=-1", "cost.crash must be >= 0, got -1"),
     (TRAIN, "projector.step_size=-1", "step_size must be finite and > 0, got -1"),
     (TRAIN, "task.reward.reading=foo", "reading must be one of normalised, raw, got 'foo'"),
     (TRAIN, "task.vehicles=abc", "task.vehicles must be a whole number or null, got 'abc'"),
     (TRAIN, "env.num_envs=abc", "env.num_envs must be a whole number, >= 1, got 'abc'"),
-    (TRAIN, "encoder.policy.heads=3", "width must be a multiple of heads, got 256 and 3"),
+    (TRAIN, "encoder.policy.heads=3", "width must be a multiple of heads, got 32 and 3"),
     (TRAIN, "lagrange.multiplier.lr=-1", "lr must be finite and > 0, got -1"),
     (TRAIN, "loss=sac", "takes no cost_critic: set cost_critic=none, or another loss"),
     (TRAIN, "algo=sac loss=sac_lag", "needs cost_critic, got cost_critic=none"),
@@ -306,7 +315,10 @@ def test_help_lists_groups_and_settings(command, capsys):
     assert not left.value.code
     text = capsys.readouterr().out
     assert "python -m saferl algo=arsac task=gs" in text
-    assert "algo: arsac, arsac_plus, arsac_signed, asac, cpo, ppo" in text and "gamma: 0.99" in text
+    assert (
+        "algo: arppo, arsac, arsac_plus, arsac_signed, asac, cpo, ppo" in text
+        and "gamma: 0.99" in text
+    )
 
 
 def test_the_readmes_everyday_commands_work_in_order(command, tmp_path: Path):

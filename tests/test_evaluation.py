@@ -176,6 +176,26 @@ def test_a_runs_closing_test_is_the_evaluation_of_its_checkpoint(tmp_path: Path,
     assert all(again[name] == theirs[name] for name in FIGURES)
 
 
+def test_a_training_ends_beside_the_drivers_that_it_names_and_with_pictures(
+    tmp_path: Path, command, capsys
+):
+    beside = ("evaluation.drivers=[blind,scripted]", "evaluation.episodes=3", "evaluation.gif=1")
+    command("train", "config", *SMALL, *EMPTY, "algo=sac", "task.duration=2", *beside, "out=run")
+    command(
+        "evaluate", "evaluate", "policy=blind", *EMPTY, "task.duration=2", "episodes=3", "out=b"
+    )
+    ours, theirs = (
+        json.loads((tmp_path / name / "metrics.json").read_text())
+        for name in ("run/evaluation/blind", "b")
+    )
+    assert all(ours[name] == theirs[name] for name in FIGURES)
+    assert (tmp_path / "run/evaluation/episode_0.gif").is_file()
+    assert (tmp_path / "run/evaluation/episode_0.png").is_file()
+    text = capsys.readouterr().out.partition("The same 3 episodes of gs")[2]
+    rows = [line.split()[0] for line in text.splitlines()[2:5]]
+    assert rows == ["sac", "blind", "scripted"] and "SR %" in text
+
+
 def test_the_command_line_alone_changes_a_runs_own_task():
     trained = compose("experiment=paper", "algo=sac_rs", *EMPTY, "task.rows=4", "task=gs")
     own = Scenario(

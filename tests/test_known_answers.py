@@ -40,7 +40,11 @@ def sums(policy, steps: int, gamma: float) -> tuple[float, float]:
 #: The problem that each states: discount of the cost in its limit, and over how many decisions.
 PROBLEMS = {
     "cpo": (GAMMA, 20, ("loss.damping=0.01", "rollout_frames=2560", "frames=800000")),
-    "ppo_lag": (1.0, 20, (f"lagrange.signal.cost_limit={LIMIT}", "experience.epochs=5")),
+    "ppo_lag": (
+        1.0,
+        20,
+        (f"lagrange.signal.cost_limit={LIMIT}", "experience.epochs=5", "loss.entropy_bonus=false"),
+    ),
     "sac_lag": (1.0, 20, (f"lagrange.signal.cost_limit={LIMIT}",)),
 }
 ASCENT = ("lagrange.multiplier.lr=0.02", "lagrange.multiplier.init=0")
@@ -68,7 +72,7 @@ def test_cart(algo: str, seed: int, tmp_path: Path):
 TABLE = (
     "encoder=mlp", "task=cart", "~task.spread", "~task.noise", "task._target_=table.Table", "task.task=table", "task.size=4",
     "task.horizon=10", "env._target_=table.TableEnv", "env.num_envs=64", "cost_limit=1",
-    "gamma=0.8", "frames=200000", "updates_per_frame=0.04", "encoder.policy.width=32",
+    "gamma=0.8", "tau=0.005", "frames=200000", "updates_per_frame=0.04", "encoder.policy.width=32",
     "encoder.policy.depth=2", "reward_scale=1", "target_entropy=-3", "compile=false",
     "projector.penalty=10", "projector.step_size=0.005", "lagrange.multiplier.lr=0.003",
     "lagrange.multiplier.init=0",
