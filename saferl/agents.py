@@ -129,6 +129,11 @@ def _check_parts(cfg: DictConfig) -> None:
         if name in takes and not present:
             raise ValueError(f"{loss} needs {name}, got {name}=none.")
     # Of the action values: those of on-policy losses are for a projector alone.
+    if "risk_critic" in takes and cfg.cost_critic.members < 2:
+        raise ValueError(
+            f"{loss} needs several members of Q_c(s, a): set cost_critic=twin, "
+            f"got {cfg.cost_critic.members}."
+        )
     has_risk = "risk_critic" in takes or (not fresh and "cost_critic" in takes)
     if cfg.projector._target_ is not None and not has_risk:
         raise ValueError(
@@ -218,7 +223,7 @@ def build_agent(cfg: DictConfig) -> Agent:
     if tuple(wanted) != keys:
         raise ValueError(
             f"{cfg.encoder.policy._target_} reads {', '.join(wanted)}, but task={cfg.task.task} observes "
-            f"{', '.join(keys)}: set encoder=mlp, or an algorithm without attention (rsac, sac, ...)."
+            f"{', '.join(keys)}: set encoder=mlp, or an algorithm with one (rsac, sac, ...)."
         )
     actor = tanh_gaussian_actor(
         encoder, width, action_dim, keys, scale_init=cfg.get("initial_std", 1.0)
@@ -262,14 +267,21 @@ def load_agent(cfg: DictConfig, path: Path, name: str) -> Agent:
 
 def _architecture(cfg: DictConfig) -> dict[str, Any]:
     """What decides whether the networks of two configurations fit, by option."""
-    options = {f"task.{key}": cfg.task.get(key) for key in ("rows", "size", "action_dim")}
-    fresh = on_policy(cfg) and "risk_critic" not in _takes(cfg)
-    for network in ("policy",) if fresh else ("policy", "value"):
+    options = {
+        f"task.{key}": cfg.task.get(key) for key in ("rows", "size", "action_dim", "observation")
+    }
+    takes = _takes(cfg)
+    # Of the critics those of action values: state values have no options.
+    critics = {"critic": "qvalue_network" in takes}
+    critics["cost_critic"] = "risk_critic" in takes or (
+        "cost_critic" in takes and not on_policy(cfg)
+    )
+    for network in ("policy", "value") if any(critics.values()) else ("policy",):
         for key, value in cfg.encoder[network].items():
             if key not in ("rows", "size"):  # the task
                 options[f"encoder.{network}.{key}"] = value
     for name in ("critic", "cost_critic"):
-        if not fresh and cfg[name].members > 0:
+        if critics[name] and cfg[name].members > 0:
             own = {"members": cfg[name].members, **_critic_options(cfg[name])}
             options |= {f"{name}.{key}": value for key, value in own.items()}
     return options

@@ -279,6 +279,11 @@ def choose_policy(
             f"task.rows must be {rows}, the number that this policy's MLP was trained with, "
             f"got {cfg.task.rows}."
         )
+    form = trained.task.get("observation")
+    if form != cfg.task.get("observation"):
+        raise ValueError(
+            f"task.observation must be {form}, by which this policy was trained, got {cfg.task.observation}."
+        )
     policy, transforms = trained_policy(compiling(trained, cfg.compile), path)
     return cfg, policy, transforms if cfg.project else [], f"{trained.algo_name} ({name})"
 

@@ -91,7 +91,7 @@ def _multiplier(trainer: Trainer) -> LagrangeMultiplier:
     multiplier = getattr(loss, "lagrange", None)
     if not isinstance(multiplier, LagrangeMultiplier):
         raise ValueError(
-            "lagrange.signal needs a loss with a multiplier (loss=sac_lag or ppo_lag), "
+            "lagrange.signal needs a loss with a multiplier (loss=sac_lag, ppo_lag or ppo_risk), "
             f"got {type(loss).__name__}."
         )
     return multiplier

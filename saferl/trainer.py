@@ -226,13 +226,14 @@ class Trainer:
     def _take(self, data: TensorDictBase) -> TensorDict:
         """Make the updates that a batch entitles to; returns its finished episodes [n]."""
         progress = self.progress
+        # Of what was spent when these frames were begun: the last batch of a run is learned from, too.
+        self.learner.schedule(self.spent)
         finished = self.window.extend(data)
         progress.frames += data.numel()
         progress.episodes += finished.shape[0]
         for hook in self.after_collect:
             hook(finished, self.spent)
         with self.clock.phase("learn"):
-            self.learner.schedule(self.spent)
             for batch in self.experience.batches(data, progress.frames):
                 progress.updates += 1
                 self._add(self.learner.update(batch))

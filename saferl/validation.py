@@ -43,7 +43,7 @@ TRAINING = {
     "tau": (float, 0, 1),
     "target_entropy": (Literal["auto"] | float, -math.inf, math.inf),
     "alpha_init": (float, 0, math.inf),
-    "initial_std": (float, 0, math.inf),
+    "initial_std": (float, 0.02, math.inf),
     "multiplier_lr": (float, 0, math.inf),
     "record_every": (int, 1, math.inf),
     "save_every": (int, 1, math.inf),
@@ -64,17 +64,8 @@ TRAINING = {
     "init": (str | None, 0, 0),
     "algo_name": (str, 0, 0),
 }
-POSITIVE = (
-    *(
-        "updates_per_frame",
-        "reward_scale",
-        "tau",
-        "alpha_init",
-        "initial_std",
-        "multiplier_lr",
-        "save_minutes",
-    ),
-)
+POSITIVE = ("updates_per_frame", "reward_scale", "tau", "alpha_init")
+POSITIVE += ("multiplier_lr", "save_minutes")
 TESTING = {
     "episodes": (int, 1, math.inf),
     "seed": (int, 0, 2**31 - 1),

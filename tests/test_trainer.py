@@ -93,7 +93,7 @@ def test_the_papers_order_with_and_without_a_temperature(algo: str, tmp_path: Pa
 
 def test_an_epoch_leaves_its_rest(tmp_path: Path):
     """A few samples would weigh as much as a whole mini-batch, and be standardised by themselves."""
-    trainer = trainer_of(tmp_path, "algo=ppo", "rollout_frames=20", "batch_size=8")
+    trainer = trainer_of(tmp_path, "algo=ppo", "rollout_frames=20", "batch_size=8", "epochs=10")
     batches = list(trainer.experience.batches(next(iter(trainer.collector)), 20))
     assert [len(batch) for batch in batches] == [8, 8] * 10
     rows = torch.cat([batch["action"] for batch in batches[:2]])

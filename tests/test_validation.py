@@ -34,7 +34,7 @@ MISTAKES = [
     ("lr=null", "lr must be a mapping of actor, critic, alpha, got None."),
     (
         "evaluation=3",
-        "evaluation must be a mapping of episodes, policy_frequency, num_envs, got 3.",
+        "evaluation must be a mapping of episodes, policy_frequency, num_envs, drivers, gif, got 3.",
     ),
     ("lagrange.multiplier=3", "lagrange.multiplier must be a mapping of _target_, "),
     ("task.reward=3", "task.reward must be a mapping of reading, risk_shaping, "),

@@ -41,7 +41,7 @@ class GaussianHead(nn.Module):
         encoder: nn.Module,
         width: int,
         action_dim: int = 2,
-        scale_lb: float = 1e-4,
+        scale_lb: float = 0.01,
         scale_init: float = 1.0,
     ):
         super().__init__()
@@ -49,7 +49,7 @@ class GaussianHead(nn.Module):
             raise ValueError(f"scale_init must be > scale_lb={scale_lb}, got {scale_init}.")
         self.encoder = encoder
         self.head = nn.Linear(width, 2 * action_dim)
-        mapping = f"biased_softplus_{scale_init}"
+        mapping = f"biased_softplus_{scale_init}_{scale_lb}"
         self.extract = NormalParamExtractor(mapping, scale_lb=scale_lb)  # pyright: ignore[reportArgumentType]
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
@@ -62,7 +62,7 @@ def tanh_gaussian_actor(
     action_dim: int = 2,
     in_keys: Sequence[NestedKey] = ("ego", "vehicles"),
     *,
-    scale_lb: float = 1e-4,
+    scale_lb: float = 0.01,
     scale_init: float = 1.0,
 ) -> ProbabilisticActor:
     """A tanh-squashed Gaussian policy, as soft actor-critic needs (Haarnoja et al., 2018).

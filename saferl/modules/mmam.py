@@ -16,6 +16,8 @@ VEHICLE_SCALE = (1.0, 20.0, 20.0, 10.0, 10.0, 1.0)
 """Divisors of a vehicle's features (I_veh, dx, dy, dv_x, dv_y, phi)."""
 
 _MASKED = -1e9
+#: Below all that a GELU gives, so that an absent vehicle is never the largest.
+BELOW_GELU = -1.0
 
 
 def feature_scale(name: str, values: Sequence[float]) -> Tensor:
@@ -48,6 +50,13 @@ def scale_vehicles(vehicles: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
         )
     present = vehicles[..., 0] > 0
     return torch.where(present.unsqueeze(-1), vehicles / scale, 0.0), present
+
+
+def largest(rows: Tensor, present: Tensor, least: float) -> Tensor:
+    """The largest of the rows [*B, M, K] that are ``present`` [*B, M, 1], [*B, K]; ``least`` where none is."""
+    if not rows.shape[-2]:
+        return rows.new_full((*rows.shape[:-2], rows.shape[-1]), least)
+    return torch.where(present, rows, least).amax(-2)
 
 
 def flat_linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
@@ -236,10 +245,10 @@ class MMAMValue(nn.Module):
 
     Q(s, a) = Y_attn . W_attn + Y_mlp . W_mlp over the N + 2 tokens of Z_2 (EV, SVs, action). Y_attn
     is one hop of multi-head ego-attention. Y_mlp is permutation-invariant (ours): the tokens of EV
-    and action and a mean over the SVs that are present go through ``depth`` layers of ``width``
-    units. With ``branch="vehicle"`` it is the mean of a layer of ``pair_width`` units that sees each
-    SV together with the EV and the action; with ``branch="scene"`` the mean of the SVs' tokens,
-    which no action changes. All activations are GELU.
+    and action and what is pooled of the SVs that are present go through ``depth`` layers of ``width``
+    units. With ``branch="vehicle"`` a layer of ``pair_width`` units sees each SV together with the EV and the
+    action, and the largest of its outputs over all SVs are taken; with ``branch="scene"`` the mean of the SVs'
+    tokens, which no action changes. All activations are GELU.
 
     Args:
         width: d, the size of a token and of both branches.
@@ -248,7 +257,7 @@ class MMAMValue(nn.Module):
         action_dim: size of the action.
         branch: what the MLP branch makes of the SVs, ``"vehicle"`` or ``"scene"`` (see above).
         depth: layers of ``width`` units in the MLP branch, at least one (ours).
-        pair_width: units of the layer applied to each SV (ours); ``None`` is ``width // 4``.
+        pair_width: units of the layer applied to each SV (ours); ``None`` is ``width``.
         ego_scale: divisors of the ego features.
         vehicle_scale: divisors of a vehicle's features; I_veh comes first.
         outputs: K, more than one for the quantiles of a distributional critic; what the attention reads
@@ -290,7 +299,7 @@ class MMAMValue(nn.Module):
         layer_norm: bool = False,
     ):
         super().__init__()
-        pooled = width // 4 if pair_width is None else pair_width
+        pooled = width if pair_width is None else pair_width
         check_sizes(width=width, depth=depth, outputs=outputs, pair_width=pooled)
         if branch not in ("vehicle", "scene"):
             raise ValueError(f"branch must be 'vehicle' or 'scene', got {branch!r}.")
@@ -327,20 +336,20 @@ class MMAMValue(nn.Module):
         query = self.attention.folded_query(ego_token)
         readout = self.attention.folded_value(self.w_attn.weight.squeeze(0))
         logits = (query @ tokens.mT).masked_fill(~present.unsqueeze(-2), _MASKED)
-        share = present[..., 1:, None].to(tokens.dtype)
-        share = share / share.sum(-2, keepdim=True).clamp(min=1.0)
+        there = present[..., 1:, None]
         # A layer on concatenated tokens is a sum of one product for each of them.
         on_ego, joint_on_action, on_pooled = self.joint.weight.tensor_split([width, 2 * width], -1)
         joint = flat_linear(ego_token, on_ego, self.joint.bias)
         scene = {"query": query, "logits": logits, "readings": flat_linear(tokens, readout).mT}
         on_token = [readout, joint_on_action]
         if self.pair is None:
-            joint = joint + flat_linear((vehicle_tokens * share).sum(-2), on_pooled)
+            mean = (vehicle_tokens * there).sum(-2) / there.sum(-2).clamp(min=1.0)
+            joint = joint + flat_linear(mean, on_pooled)
         else:
             on_vehicle, on_ego, pair_on_action = self.pair.weight.split(width, dim=-1)
             pair = flat_linear(vehicle_tokens, on_vehicle, self.pair.bias)
             pair = pair + flat_linear(ego_token, on_ego).unsqueeze(-2)
-            scene |= {"pair": pair, "share": share, "joint_on_pooled": on_pooled}
+            scene |= {"pair": pair, "present": there, "joint_on_pooled": on_pooled}
             on_token.append(pair_on_action)
         scene |= {"joint": joint, "on_token": torch.cat(on_token)}
         scene |= {"action": [self.action.weight, self.action.bias], "w_mlp": self.w_mlp.weight}
@@ -360,7 +369,7 @@ class MMAMValue(nn.Module):
         y_mlp = scene["joint"] + on_joint
         if "pair" in scene:
             pairs = F.gelu(scene["pair"] + on_pair.unsqueeze(-2))
-            pooled = (pairs * scene["share"]).sum(-2)
+            pooled = largest(pairs, scene["present"], BELOW_GELU)
             y_mlp = y_mlp + flat_linear(pooled, scene["joint_on_pooled"])
         for weight, bias in scene["layers"]:
             y_mlp = flat_linear(self._activate(y_mlp), weight, bias)

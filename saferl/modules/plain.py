@@ -11,7 +11,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from saferl.modules.mmam import _MASKED, MMAMPolicyEncoder, MMAMValue, _EgoAttention
+from saferl.modules.mmam import (
+    _MASKED,
+    BELOW_GELU,
+    MMAMPolicyEncoder,
+    MMAMValue,
+    _EgoAttention,
+    largest,
+)
 
 
 def _attend(
@@ -87,12 +94,13 @@ class PlainMMAMValue(MMAMValue):
         )
 
         ego_token, vehicle_tokens = tokens[..., :1, :], tokens[..., 1:-1, :]
-        share = present[..., 1:, None].to(tokens.dtype)
-        pairs = vehicle_tokens
-        if self.pair is not None:
+        there = present[..., 1:, None]
+        if self.pair is None:
+            pooled = (vehicle_tokens * there).sum(-2) / there.sum(-2).clamp(min=1.0)
+        else:
             rest = [x.expand_as(vehicle_tokens) for x in (ego_token, action_token)]
             pairs = F.gelu(self.pair(torch.cat([vehicle_tokens, *rest], dim=-1)))
-        pooled = (pairs * share).sum(-2) / share.sum(-2).clamp(min=1.0)
+            pooled = largest(pairs, there, BELOW_GELU)
         parts = [ego_token.squeeze(-2), action_token.squeeze(-2), pooled]
         y_mlp = self._activate(self.joint(torch.cat(parts, dim=-1)))
         for layer in self.layers:

@@ -15,6 +15,7 @@ from saferl.modules.mmam import (
     check_sizes,
     feature_scale,
     flat_linear,
+    largest,
     scale_ego,
     scale_vehicles,
 )
@@ -40,7 +41,7 @@ class _PooledScene(nn.Module):
         rows = flat_linear(features, self.vehicle.weight, self.vehicle.bias)
         rows = F.relu(rows + self.ego(ego).unsqueeze(-2))
         # What is absent is 0, as is the least of a ReLU: an empty road needs no exception.
-        pooled = torch.where(present.unsqueeze(-1), rows, 0.0).amax(-2)
+        pooled = largest(rows, present.unsqueeze(-1), 0.0)
         return torch.cat([ego, pooled], dim=-1)
 
 

@@ -15,7 +15,8 @@ from torchrl.objectives.utils import distance_loss
 
 from saferl.modules import BoundCritics, CriticEnsemble, LagrangeMultiplier, Largest
 from saferl.objectives.advantages import CostValueLoss
-from saferl.objectives.checks import check_begun, check_lagrange, count_members
+from saferl.objectives.checks import check_begun, check_lagrange
+from saferl.objectives.cost import quantile_loss
 
 
 @dataclass
@@ -241,7 +242,10 @@ class RiskPPOLoss(PPOLagLoss):
         separate_losses: bool = False,
         reduction: Literal["none", "mean", "sum"] | None = None,
     ) -> None:
-        count = count_members("risk_critic", risk_critic, "", None)
+        if not isinstance(risk_critic, list) or len(risk_critic) < 2:
+            raise ValueError(
+                f"risk_critic must be a list of two critics or more, got {risk_critic!r}."
+            )
         super().__init__(
             actor_network,
             critic_network,
@@ -258,7 +262,7 @@ class RiskPPOLoss(PPOLagLoss):
             reduction=reduction,
         )
         self.risk = risk or Largest()
-        self.convert_to_functional(risk_critic, "risk_critic", count)  # pyright: ignore
+        self.convert_to_functional(risk_critic, "risk_critic", len(risk_critic))  # pyright: ignore
         self.out_keys = [*self.out_keys, "loss_risk"]
 
     @property
@@ -279,7 +283,8 @@ class RiskPPOLoss(PPOLagLoss):
         return out
 
     def risk_loss(self, tensordict: TensorDictBase) -> Tensor:
-        """Half the squared error of each Q_c(s, a) against ``"cost_value_target"``, summed and reduced.
+        """Half the squared error of each Q_c(s, a) against ``"cost_value_target"``, or, of critics with K > 1 outputs,
+        the loss of their quantiles, summed and reduced.
 
         Args:
             tensordict: ``[*B]`` as :meth:`begin` leaves it.
@@ -291,6 +296,8 @@ class RiskPPOLoss(PPOLagLoss):
             self.risk_critic, self.risk_critic_params, tensordict, action_key=keys.action
         )
         predicted = critics.values(action)
-        target = tensordict.get(keys.cost_value_target).expand_as(predicted)
-        loss = 0.5 * distance_loss(predicted, target, loss_function="l2").sum(0).squeeze(-1)
-        return self._reduce_loss(loss, tensordict)
+        target = tensordict.get(keys.cost_value_target)
+        if predicted.shape[-1] > 1:
+            return self._reduce_loss(quantile_loss(predicted, target).sum(0), tensordict)
+        loss = 0.5 * distance_loss(predicted, target.expand_as(predicted), loss_function="l2")
+        return self._reduce_loss(loss.sum(0).squeeze(-1), tensordict)

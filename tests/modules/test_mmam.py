@@ -93,11 +93,13 @@ def plain_value(net, ego, vehicles, action, scale):
     z_action = F.gelu(net.action(action)).unsqueeze(0)
     z_2 = torch.cat([z_ego, z_sv, z_action])
     y_attn = multi_head(z_ego, z_2, *weights_of(net.attention), scale)
-    pooled = torch.zeros(1, net.joint.in_features - 2 * WIDTH, dtype=ego.dtype)
-    for row in z_sv:
-        if net.pair is not None:
+    if net.pair is None:
+        pooled = sum((row / len(z_sv) for row in z_sv), torch.zeros_like(z_ego))
+    else:
+        pooled = torch.full((1, net.pair.out_features), -1.0, dtype=ego.dtype)
+        for row in z_sv:
             row = F.gelu(net.pair(torch.cat([row, z_ego[0], z_action[0]])))
-        pooled = pooled + row / len(z_sv)
+            pooled = torch.maximum(pooled, row)
     y_mlp = F.gelu(net.joint(torch.cat([z_ego, z_action, pooled], dim=-1)))
     for layer in net.layers:
         y_mlp = F.gelu(layer(y_mlp))

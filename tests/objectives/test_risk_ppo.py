@@ -11,17 +11,17 @@ from saferl.modules import DualAscent, MeanStd, MLPValue, tanh_gaussian_actor, v
 from saferl.objectives import PPOLagLoss, RiskPPOLoss
 
 
-def member():
-    network = MLPValue(size=SIZE, width=8, depth=1)
+def member(outputs: int = 1):
+    network = MLPValue(size=SIZE, width=8, depth=1, outputs=outputs)
     keys = ("observation", "action")
     return value_operator(network, in_keys=keys, out_key="state_action_cost_value").double()
 
 
-def build(members: int = 2, **settings):
+def build(members: int = 2, outputs: int = 1, **settings):
     torch.manual_seed(0)
     actor = tanh_gaussian_actor(encoder(), 8, 2, in_keys=["observation"]).double()
     parts = actor, value("state_value").double(), value("state_cost_value").double()
-    critics = [member() for _ in range(members)]
+    critics = [member(outputs) for _ in range(members)]
     loss = RiskPPOLoss(*parts, critics, lagrange=DualAscent(init=0.7), **settings)
     plain = PPOLagLoss(*parts, lagrange=DualAscent(init=0.7))
     for each in (loss, plain):
@@ -67,6 +67,17 @@ def test_the_projectors_risk_is_live():
     assert risk(states)["state_action_cost_value"].abs().max() < 1e-5
 
 
+def test_quantiles_are_fitted_as_quantiles():
+    loss, _, critics, data = build(outputs=4)
+    states = data.select("observation", "action")
+    expected = 0.0
+    for critic in critics:
+        error = data["cost_value_target"] - critic(states.copy())["state_action_cost_value"]
+        level = (torch.arange(4).double() + 0.5) / 4
+        expected = expected + torch.maximum(level * error, (level - 1) * error).sum(-1).mean()
+    torch.testing.assert_close(loss(data)["loss_risk"], expected)
+
+
 def test_one_member_is_refused():
-    with pytest.raises(ValueError, match="risk_critic must be a critic or a list of several"):
+    with pytest.raises(ValueError, match="risk_critic must be a list of two critics or more"):
         build(members=1)

@@ -207,7 +207,7 @@ def advance(scenario: Scenario, state: State, action: Tensor) -> tuple[State, St
     seen, own = look(scenario, after)
     after |= seen
     off = offroad(ego)
-    cost = cost + scenario.cost.crash * (off | collision)
+    cost = scenario.cost.with_crash(cost, off | collision)
     success = arrived(ego, route) & ~off & ~collision
     reward = scenario.reward(
         ego, route, control, previous, own[:, -2], own[:, -1], seen["within_view"].any(-1),

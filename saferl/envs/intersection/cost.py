@@ -1,4 +1,4 @@
-"""The cost: predicted collisions (Algorithm 2)."""
+"""The cost: predicted collisions (Algorithm 2), and crashes."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class CollisionCost:
         decay: w.
         base_speed: m/s.
         initial: C_init.
-        crash: what a collision or leaving the road adds (ours); the paper charges predictions alone, and an
-            episode that a crash has ended costs no more.
+        crash: what a collision or leaving the road costs (ours), see :meth:`with_crash`; the paper charges predictions
+            alone, and an episode that a crash has ended costs no more.
 
     >>> ego = torch.tensor([0., 0., 9., 0., 0., 0.])
     >>> ahead = torch.tensor([[5.5, 0., 0., 0., 0., 0.]])  # a standing car, half a metre ahead
@@ -46,7 +46,7 @@ class CollisionCost:
     decay: float = 1.0
     base_speed: float = 9.0
     initial: float = 0.05
-    crash: float = 0.0
+    crash: float = 1.0
 
     def __post_init__(self):
         for name in ("steps", "dt", "base_speed"):
@@ -85,3 +85,7 @@ class CollisionCost:
         price = (self.initial / self.base_speed) * torch.exp(-self.decay * beta)
         total = torch.where((gap <= 0) & observed, price[:, None], 0.0).sum((0, 1))
         return total * speed / observed.sum(0).clamp_min(1)
+
+    def with_crash(self, predicted: Tensor, crashed: Tensor) -> Tensor:
+        """Cost [...] of a decision: its predicted collisions, and whether it ended in a crash, bool [...]."""
+        return predicted + self.crash * crashed

@@ -42,7 +42,7 @@ class IntersectionEnv(gymnasium.Env):
 
     The observation is a dict of ``ego`` [F] and ``vehicles`` [rows, G] (:func:`observe`, SI units),
     the action [2] in [-1, 1] is (a_x / 5 m/s^2, delta_f / 0.6 rad). ``info`` holds ``cost``
-    (Algorithm 2 on the state before the step and the executed action; 0.0 at reset), the outcomes
+    (:class:`CollisionCost` of the state before the step and the executed action; 0.0 at reset), the outcomes
     ``collision``, ``offroad``, ``success``, and ``route`` and ``task``.
 
     All randomness comes from ``np_random``: the same seed and actions give the same episode, bit
@@ -206,7 +206,7 @@ class IntersectionEnv(gymnasium.Env):
         ego, scenario = self.ego, self.scenario
         control = to_physical(torch.as_tensor(np.asarray(action), dtype=torch.float64))
         previous = control if self._control is None else self._control
-        cost = float(scenario.cost(ego.state, control, self._vehicles, self._observed))
+        predicted = scenario.cost(ego.state, control, self._vehicles, self._observed)
         ego.act(control)
         collision = False
         for _ in range(SUBSTEPS):
@@ -220,7 +220,7 @@ class IntersectionEnv(gymnasium.Env):
         self._control, self._steps = control, self._steps + 1
         observation = self._observe()
         off = bool(offroad(ego.state))
-        cost += scenario.cost.crash * (off or collision)
+        cost = float(scenario.cost.with_crash(predicted, torch.tensor(off or collision)))
         success = not (collision or off) and bool(arrived(ego.state, self._route))
         reward = scenario.reward(
             ego.state, self._route, control, previous, self._own[-2], self._own[-1],
