@@ -43,7 +43,7 @@ MISTAKES = [
     (TRAIN, "gamma=nan", "got nan"),
     (TRAIN, "cost_limit=-1", "cost_limit must be a number, >= 0, got -1"),
     (TRAIN, "episodes=0", "episodes must be a whole number or null, >= 1, got 0"),
-    (TRAIN, "episodes=null", "Give one budget, episodes or frames"),
+    (TRAIN, "frames=null", "Give one budget, episodes or frames"),
     (TRAIN, "episodes=5 frames=10000", "Give one budget, episodes or frames"),
     (TRAIN, "device=foo", "device must be one of auto, cpu, cuda, got 'foo'"),
     (TRAIN, "seed=-1", "seed must be a whole number, >= 0 and <= 2147483647, got -1"),
