@@ -163,7 +163,7 @@ def test_algorithm_builds_and_makes_updates(algo: str, task: str, tmp_path: Path
             with pytest.raises(ValueError, match="set shaping=none"):
                 build_trainer(cfg, tmp_path)
             return
-        if cfg.encoder.policy._target_.endswith("MMAMPolicyEncoder"):
+        if cfg.encoder.policy._target_.endswith(("MMAMPolicyEncoder", "SetPolicyEncoder")):
             with pytest.raises(
                 ValueError, match="reads ego, vehicles, but task=.* set encoder=mlp"
             ):

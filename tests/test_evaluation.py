@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 
 import hydra
@@ -20,6 +21,7 @@ from saferl.checkpoint import CONFIG, export
 from saferl.commands import on_its_own_task, trained_policy
 from saferl.envs.intersection import (
     BatchedIntersection,
+    CollisionCost,
     HighwayIntersection,
     IntersectionEnv,
     Reward,
@@ -87,8 +89,9 @@ def test_figures_against_gymnasium_by_hand():
         observation, reward, terminated, truncated, info = env.step(action.numpy())
         rewards.append(reward)
         costs.append(info["cost"])
-        speeds.append(float((observation["ego"][3:5] ** 2).sum() ** 0.5))
-        distances.append(float(observation["ego"][7]))
+        own = dict(zip(env.scenario.form.ego, observation["ego"].tolist(), strict=True))
+        speeds.append(math.hypot(own["v_x"], own["v_y"]))
+        distances.append(own["d_veh"])
         done = terminated or truncated
     assert row["decisions"] == len(rewards)
     assert row["return"] == pytest.approx(sum(rewards), rel=1e-5)
@@ -199,8 +202,8 @@ def test_a_training_ends_beside_the_drivers_that_it_names_and_with_pictures(
 def test_the_command_line_alone_changes_a_runs_own_task():
     trained = compose("experiment=paper", "algo=sac_rs", *EMPTY, "task.rows=4", "task=gs")
     own = Scenario(
-        task="gs", vehicles=0, rows=4, policy_frequency=10,
-        reward=Reward(reading="raw", destination_scale=100.0),
+        task="gs", vehicles=0, rows=4, policy_frequency=10, observation="world",
+        reward=Reward(reading="raw", destination_scale=100.0), cost=CollisionCost(crash=0.0),
     )  # fmt: skip
     overrides: dict[tuple[str, ...], dict] = {
         (): {},

@@ -128,6 +128,17 @@ def test_learning_rates_are_linear_in_the_budget(tmp_path: Path):
     assert len(set(held)) == len(held)
 
 
+def test_the_last_batch_is_learned_from(tmp_path: Path):
+    """A rate that falls to 0 is what was spent when a batch was begun, not when it is there."""
+    options = ("algo=ppo", "rollout_frames=8", "env.num_envs=4", "frames=8", "lr.actor=[1e-2,0]")
+    trainer = trainer_of(tmp_path, *options)
+    weights = trainer.learner.loss.actor_network_params.clone()
+    trainer.train()
+    assert trainer.progress.frames == 8
+    assert (trainer.learner.loss.actor_network_params != weights).any()
+    assert trainer.metrics.read()[-1]["lr_actor"] == 1e-2
+
+
 def test_an_update_moves_everything_that_learns(tmp_path: Path):
     trainer = trainer_of(tmp_path, "algo=arsac", "tau=0.25", "lagrange.multiplier.init=2.0")
     collect(trainer, 3)
@@ -182,7 +193,8 @@ def test_projector_starts_when_it_is_told(tmp_path: Path):
 
 
 def test_buffer_keeps_the_executed_action_and_unscaled_reward(tmp_path: Path):
-    trainer = trainer_of(tmp_path, "algo=rsac", "cost_limit=0", "reward_scale=0.1")
+    options = ("algo=rsac", "cost_limit=0", "reward_scale=0.1", "projector.start=0")
+    trainer = trainer_of(tmp_path, *options)
     always_risky(trainer)
     data = torch.cat([each.reshape(-1) for each in collect(trainer, 3)])
     rows = trainer.experience.buffer.storage[:6]
@@ -201,7 +213,7 @@ def test_an_end_on_the_last_step_does_not_bootstrap(late: int):
     and it is truncated alone, which the environment's own flag says (docs/pitfalls.md, 12)."""
     free = BatchedIntersection(Scenario(task="rt", vehicles=0), num_envs=1, seed=3)
     steps = free.rollout(125, Driver()).shape[-1]
-    scenario = Scenario(task="rt", vehicles=0, duration=(steps - late) / 5)
+    scenario = Scenario(task="rt", vehicles=0, duration=(steps - late) / 5, observation="world")
     env = TransformedEnv(
         BatchedIntersection(scenario, num_envs=1, seed=3),
         RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"]),
@@ -225,7 +237,12 @@ def test_an_end_on_the_last_step_does_not_bootstrap(late: int):
 def test_episode_signal_uses_each_fresh_episode_once(tmp_path: Path):
     """Not a stale mean at every gradient step (docs/pitfalls.md, 5), nothing where none ended (docs/pitfalls.md, 10)."""
     trainer = trainer_of(
-        tmp_path, "algo=sac_lag", "task.duration=1", "frames=200", "lagrange.multiplier.lr=0.1"
+        tmp_path,
+        "algo=sac_lag",
+        "task.duration=1",
+        "task.cost.crash=0",
+        "frames=200",
+        "multiplier_lr=0.1",
     )
     seen: list[list[float]] = []
     lagrange = trainer.learner.loss.lagrange
@@ -235,10 +252,10 @@ def test_episode_signal_uses_each_fresh_episode_once(tmp_path: Path):
     limit = episode_budget(0.05, 0.99, horizon=5)
     ended = [each["next", "episode_cost"][each["next", "done"]] for each in data]
     expected = [(costs - limit).tolist() for costs in ended if len(costs)]
-    assert seen == [pytest.approx(costs) for costs in expected] and len(seen) == 2
+    assert seen == [pytest.approx(costs) for costs in expected] and len(data) > len(seen) >= 2
     assert trainer.progress.updates > len(seen)
-    # Two rounds of plain signed ascent on costs of 0 (an empty road).
-    assert float(lagrange.value) == pytest.approx(1.0 - 2 * 0.1 * limit)
+    # Rounds of plain signed ascent on costs of 0 (an empty road).
+    assert float(lagrange.value) == pytest.approx(1.0 - len(seen) * 0.1 * limit)
 
 
 def test_signals_refuse_a_loss_without_multiplier(tmp_path: Path):

@@ -16,7 +16,7 @@ from batch import (
 )
 from torchrl.envs.utils import check_env_specs
 
-from saferl.envs.intersection import BatchedIntersection, Scenario
+from saferl.envs.intersection import BatchedIntersection, CollisionCost, Scenario
 from saferl.envs.intersection.base import OUTCOMES
 from saferl.envs.intersection.batched import vehicles_of
 from saferl.envs.seeding import episode_seeds, mix, uniform
@@ -314,3 +314,14 @@ def test_an_action_of_another_precision_changes_no_type():
     data = env.reset().set("action", torch.zeros(2, 2, dtype=torch.float64))
     after = env.step(data)["next"]
     assert all(after[key].dtype == torch.float32 for key in ("ego", "vehicles", "reward", "cost"))
+
+
+@pytest.mark.parametrize("crash", [0.0, 1.0])
+def test_a_crash_costs_what_its_setting_says(crash):
+    """Off the road at full lock, with nobody to be predicted to hit."""
+    env = make(1, task="gs", cost=CollisionCost(crash=crash))
+    view, costs = reset(env), []
+    while not view["done"].any():
+        view = step(env, (0.5, 1.0))
+        costs.append(float(view["cost"]))
+    assert view["offroad"].all() and costs[-1] == crash and not any(costs[:-1])
