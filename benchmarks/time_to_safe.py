@@ -159,7 +159,9 @@ def peer(name: str, out: Path, minutes: float, episodes: int) -> None:
                 success, crash = info["success"], info["collision"] or info["offroad"]
             else:
                 road: Any = env.unwrapped
-                success, crash = road.has_arrived(road.vehicle), info["crashed"]
+                # It asks for the nearest lane alone: whoever has left the road may be said to have arrived.
+                crash = info["crashed"] or not road.vehicle.on_road
+                success = road.has_arrived(road.vehicle)
             end = "collision" if crash else "success" if success else "frozen"
             ends[end] += 1
     count = sum(ends.values())
