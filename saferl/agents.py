@@ -225,9 +225,9 @@ def build_agent(cfg: DictConfig) -> Agent:
             f"{cfg.encoder.policy._target_} reads {', '.join(wanted)}, but task={cfg.task.task} observes "
             f"{', '.join(keys)}: set encoder=mlp, or an algorithm with one (rsac, sac, ...)."
         )
-    actor = tanh_gaussian_actor(
-        encoder, width, action_dim, keys, scale_init=cfg.get("initial_std", 1.0)
-    ).to(device)
+    actor = tanh_gaussian_actor(encoder, width, action_dim, keys, scale_init=cfg.initial_std).to(
+        device
+    )
     parts = {
         "actor_network": lambda: actor,
         "qvalue_network": lambda: alone_or_all(

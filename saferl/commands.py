@@ -26,9 +26,10 @@ from saferl.envs.intersection import Scenario
 from saferl.envs.intersection.drivers import driver
 from saferl.evaluation import TEST, as_test, envs_at_once, write
 from saferl.evaluation import evaluate as play_episodes
-from saferl.metrics import comparison, summarise, table
+from saferl.metrics import FIGURES, summarise, table
 from saferl.paths import pretrained_run
 from saferl.progress import Budget
+from saferl.summary import side_by_side
 from saferl.validation import check_testing
 
 log = logging.getLogger(__name__)
@@ -95,8 +96,14 @@ def closing_test(cfg: DictConfig, run: Path) -> None:
         results[name] = test(driver(name, cfg.seed), [], name, out / name)
     if settings.drivers:
         title = f"The same {settings.episodes} episodes of {scenario.task}"
-        figures = {name: summarise(rows) for name, rows in results.items()}
-        log.info("\n%s", comparison(figures, title))
+        runs = [
+            (
+                {"algo_name": name, "task": {"task": scenario.task}},
+                {"episodes": len(rows), **summarise(rows)},
+            )
+            for name, rows in results.items()
+        ]
+        log.info("\n%s\n%s", title, side_by_side(runs, tuple(FIGURES)))
     pictures(cfg, scenario, policy, transforms, results[cfg.algo_name][: settings.gif], out)
 
 

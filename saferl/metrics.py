@@ -194,28 +194,3 @@ def table(figures: dict[str, dict[str, float]], title: str = "") -> str:
         mean, low, high = (value[key] * scale for key in ("mean", "low", "high"))
         lines.append(f"{short:<14}{mean:>10.2f}{unit:<2} [{low:.2f}, {high:.2f}]{unit}")
     return "\n".join(lines)
-
-
-def comparison(policies: dict[str, dict[str, dict[str, float]]], title: str = "") -> str:
-    """A plain-text table of several policies' figures on the same episodes, one row a policy, rates in percent.
-
-    Args:
-        policies: by name what :func:`summarise` gives.
-
-    >>> print(comparison({"blind": {"success_rate": {"mean": 0.5, "low": 0.4, "high": 0.6}}}))
-               SR %
-    blind      50.0
-    """
-    names = list(next(iter(policies.values())))
-    scales = {name: 100.0 if name.endswith("_rate") else 1.0 for name in names}
-    heads = [FIGURES[n][0] + (" %" if scales[n] == 100.0 else "") for n in names]
-    wide = max(len(name) for name in policies) + 2
-    lines = [title] if title else []
-    lines.append(" " * wide + "".join(f"{head:>{max(8, len(head) + 2)}}" for head in heads))
-    for policy, figures in policies.items():
-        cells = (
-            f"{scales[name] * figures[name]['mean']:>{max(8, len(head) + 2)}.{1 + (name == 'cost_return') * 2}f}"
-            for name, head in zip(names, heads, strict=True)
-        )
-        lines.append(f"{policy:<{wide}}" + "".join(cells))
-    return "\n".join(line.rstrip() for line in lines)

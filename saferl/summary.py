@@ -73,11 +73,12 @@ def names(configs: Sequence[Mapping]) -> list[str]:
     return called
 
 
-def side_by_side(runs: Sequence[tuple[Mapping, Mapping]]) -> str:
+def side_by_side(runs: Sequence[tuple[Mapping, Mapping]], columns: Sequence[str] = COLUMNS) -> str:
     """A table of closing tests, one row for each composition, its seeds taken together.
 
     Args:
         runs: configuration and figures (``metrics.json``) of each.
+        columns: names of figures, of which those are shown that some run has.
 
     Returns:
         Means with 95% intervals: over seeds (Student's t, wide for few; of rates never narrower than Wilson's of
@@ -88,7 +89,7 @@ def side_by_side(runs: Sequence[tuple[Mapping, Mapping]]) -> str:
     groups: dict[str, list[Mapping]] = {}
     for name, (_, figures) in zip(names([config for config, _ in runs]), runs, strict=True):
         groups.setdefault(name, []).append(figures)
-    columns = [name for name in COLUMNS if any(name in figures for _, figures in runs)]
+    columns = [name for name in columns if any(name in figures for _, figures in runs)]
     titles = [FIGURES[name][0] + " %" * name.endswith("_rate") for name in columns]
     rows = [["", "runs", *titles]]
     for name, tests in groups.items():

@@ -64,8 +64,14 @@ TRAINING = {
     "init": (str | None, 0, 0),
     "algo_name": (str, 0, 0),
 }
-POSITIVE = ("updates_per_frame", "reward_scale", "tau", "alpha_init")
-POSITIVE += ("multiplier_lr", "save_minutes")
+POSITIVE = (
+    "updates_per_frame",
+    "reward_scale",
+    "tau",
+    "alpha_init",
+    "multiplier_lr",
+    "save_minutes",
+)
 TESTING = {
     "episodes": (int, 1, math.inf),
     "seed": (int, 0, 2**31 - 1),

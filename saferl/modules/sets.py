@@ -50,7 +50,7 @@ class SetPolicyEncoder(MLPPolicyEncoder):
 
     A layer sees each vehicle together with the ego; of its outputs the largest over all vehicles go on (deep
     sets, Zaheer et al., 2017, with the pooling of PointNet, Qi et al., 2017). Permuting vehicles, or adding
-    absent rows, changes nothing, and any number of rows will do. It costs about a tenth of
+    absent rows, changes nothing, and any number of rows will do. It is cheaper than
     :class:`~saferl.modules.MMAMPolicyEncoder`.
 
     Args:

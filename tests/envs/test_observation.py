@@ -300,11 +300,11 @@ def looped_route(ego, vehicles, present, route, rows):
     own, world, nearest = looped(ego, vehicles, present, route, rows)
     lines = reference_lines(torch.tensor(int(route)), torch.zeros(1, dtype=torch.float64))
     offsets, headings = [], []
+    start = nearest_on(lines[0], ego[0], ego[1])[1]
     for line in lines:
-        (x, y, heading), s = nearest_on(line, ego[0], ego[1])
+        (x, y, heading), _ = nearest_on(line, ego[0], ego[1])
         offsets.append((ego[1] - y) * math.cos(heading) - (ego[0] - x) * math.sin(heading))
         headings.append(folded(ego[4] - heading))
-        start = s if not len(offsets) - 1 else start  # noqa: F821  (of the first line)
     ahead = [
         folded(float(line_pose(lines[0], torch.tensor(start + d).double())[2]) - ego[4])
         for d in PREVIEW
