@@ -27,7 +27,6 @@ from saferl.envs.transforms import ExecutedAction
 from saferl.experience import Epochs, Replay
 from saferl.hooks import ProjectorProgress
 from saferl.learner import Learner
-from saferl.modules import compiled
 from saferl.progress import Budget
 from saferl.trainer import Trainer
 from saferl.validation import arguments, check_targets, check_training
@@ -132,14 +131,12 @@ def _has_targets(loss: LossModule) -> bool:
 
 def build_learner(cfg: DictConfig, loss: LossModule) -> Learner:
     """What makes an update of a loss: optimizer, targets, order, and whether it is compiled."""
-    # A GPU would wait for Python between the many small kernels of a loss: CUDA graphs.
-    mode = "reduce-overhead" if device_of(cfg).type == "cuda" else None
     return Learner(
         loss,
         build_optimizer(cfg, loss),
         SoftUpdate(loss, tau=cfg.tau) if _has_targets(loss) else None,
         order=cfg.get("update_order", "joint"),  # a run from before this setting has none
-        compile=partial(compiled, mode=mode) if cfg.compile else None,
+        compile=cfg.compile,
     )
 
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import chain
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.objectives import LossModule, SoftUpdate
 
-log = logging.getLogger(__name__)
+from saferl.modules import Compiled
 
 #: Names of the parameter groups that step together, one after the other.
 ORDERS = {
@@ -31,7 +32,7 @@ class Learner:
         order: ``"joint"``: every term at the same parameters, then one step of all, as TorchRL's
             losses do. ``"sequential"`` (paper, Algorithm 1): critics, actor and temperature in turn,
             each at the parameters that the one before left, which evaluates the loss three times.
-        compile: what makes the loss faster, such as :func:`saferl.modules.compiled`; None: nothing.
+        compile: whether losses and gradients are compiled, as one graph for each stage of ``order``.
 
     Raises:
         ValueError: ``order`` is unknown, or a group has another name.
@@ -46,7 +47,7 @@ class Learner:
         target_updater: SoftUpdate | None = None,
         after_update: list[Callable[[TensorDictBase], None]] | None = None,
         order: str = "joint",
-        compile: Callable[[LossModule], Callable] | None = None,
+        compile: bool = False,
     ):
         if order not in ORDERS:
             raise ValueError(f"order must be one of {', '.join(ORDERS)}, got {order!r}.")
@@ -59,10 +60,12 @@ class Learner:
         self.stages = [names for names in ORDERS[order] if there & set(names)]
         self.loss, self.optimizer, self.target_updater = loss, optimizer, target_updater
         self.after_update = after_update or []
-        self._forward = loss
-        if compile is not None:
-            log.info("Compiling the loss at its first update: this takes about a minute.")
-            self._forward = compile(loss)
+        self.gradients: dict[tuple[str, ...], Callable] = {}
+        for names in self.stages:
+            gradients = partial(self._gradients, names)
+            self.gradients[names] = (
+                Compiled(gradients, f"the update of {', '.join(names)}") if compile else gradients
+            )
 
     def schedule(self, spent: float) -> None:
         """Set the learning rates for a fraction of the budget."""
@@ -70,18 +73,33 @@ class Learner:
             first, last = group.get("schedule", (group["lr"], group["lr"]))
             group["lr"] = first + (last - first) * spent
 
+    def _parameters(self, names: tuple[str, ...]) -> list[torch.nn.Parameter]:
+        groups = (g["params"] for g in self.optimizer.param_groups if g["name"] in names)
+        return list(chain(*groups))
+
+    def _gradients(
+        self, names: tuple[str, ...], batch: TensorDictBase
+    ) -> tuple[TensorDictBase, TensorDictBase, Sequence[Tensor | None]]:
+        """The loss's output, what it wrote into the batch, and the gradients of the named groups."""
+        given, batch = list(batch.keys(True, True)), batch.copy()
+        losses = self.loss(batch)
+        terms = [value for key, value in losses.items() if key.startswith("loss_")]
+        gradients = torch.autograd.grad(
+            torch.stack(terms).sum(), self._parameters(names), allow_unused=True
+        )
+        return losses.detach(), batch.exclude(*given).detach(), gradients
+
     def update(self, batch: TensorDictBase) -> TensorDict:
-        """Returns the loss terms and metrics, detached scalars."""
+        """Returns the loss terms and metrics, detached scalars; priorities come into the batch."""
         for names in self.stages:
-            groups = [g["params"] for g in self.optimizer.param_groups if g["name"] in names]
-            losses = self._forward(batch)
-            terms = [value for key, value in losses.items() if key.startswith("loss_")]
-            # Parameters without a gradient stay where they are.
-            torch.stack(terms).sum().backward(inputs=list(chain(*groups)))
+            losses, written, gradients = self.gradients[names](batch)
+            for parameter, gradient in zip(self._parameters(names), gradients, strict=True):
+                parameter.grad = gradient  # without one a parameter stays where it is
             self.optimizer.step()
             self.optimizer.zero_grad(set_to_none=True)
+        batch.update(written)
         if self.target_updater is not None:
             self.target_updater.step()
         for hook in self.after_update:
             hook(losses)
-        return losses.detach()
+        return losses

@@ -5,9 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-import warnings
 from pathlib import Path
-from warnings import catch_warnings, simplefilter, warn_explicit
 
 import hydra
 import pytest
@@ -315,24 +313,6 @@ def test_no_episode_need_end(tmp_path: Path):
     with (tmp_path / "metrics.csv").open() as file:
         row = next(csv.DictReader(file))
     assert row["episodes"] == "0" and math.isnan(float(row["return"]))
-
-
-def test_compiling_leaves_everyones_warnings_alone(tmp_path: Path, monkeypatch):
-    def compile(loss, **_):
-        def compiled(batch):
-            warn_explicit("of how it compiles", UserWarning, "utils.py", 1, "tensordict.utils")
-            return loss(batch)
-
-        return compiled
-
-    monkeypatch.setattr(torch, "compile", compile)
-    with catch_warnings(record=True) as heard:
-        simplefilter("always")
-        before = list(warnings.filters)
-        trainer = trainer_of(tmp_path, "algo=sac", "compile=true", "env.compile_physics=false")
-        collect(trainer, 5)
-        assert trainer.progress.updates and warnings.filters == before
-    assert not any("of how it compiles" in str(each.message) for each in heard)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """Networks, critics, multipliers and the projection that algorithms are composed of."""
 
 from saferl.modules.actors import GaussianHead, tanh_gaussian_actor
-from saferl.modules.compiling import compiled
+from saferl.modules.compiling import Compiled
 from saferl.modules.critics import (
     BoundCritics,
     CriticEnsemble,
@@ -22,6 +22,7 @@ __all__ = [
     "VEHICLE_SCALE",
     "BoundCritics",
     "CVaR",
+    "Compiled",
     "CriticEnsemble",
     "DualAscent",
     "GaussianHead",
@@ -39,7 +40,6 @@ __all__ = [
     "SetPolicyEncoder",
     "SetValue",
     "StateValue",
-    "compiled",
     "project",
     "tanh_gaussian_actor",
     "value_operator",

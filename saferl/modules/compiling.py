@@ -2,34 +2,107 @@
 
 from __future__ import annotations
 
-import warnings
+import logging
+import time
 from collections.abc import Callable
+from typing import Any
 
 import torch
+from torch import Tensor
+from torch.fx.experimental.proxy_tensor import make_fx
+from torch.utils._pytree import tree_flatten, tree_unflatten
+
+log = logging.getLogger(__name__)
 
 
-def compiled(function: Callable, mode: str | None = None, cpp: bool = False) -> Callable:
-    """``function`` compiled, each shape of its inputs anew, without warnings about how TensorDict compiles.
+class Compiled:
+    """A function as one graph of tensor operations for each form of its arguments, compiled.
+
+    The function runs once, on the first arguments of a form, while its operations are written down, the
+    gradients that it takes among them; ``torch.compile`` gets that list. So a loss with hundreds of
+    TensorDict operations compiles in seconds where following its Python takes minutes, and the graphs are this
+    object's own: however many there are in a process, none takes another's place. It draws the random numbers
+    that the function would, so that steps may be compiled or not in turn.
+
+    Tensors that are no arguments, such as parameters, are read where they are: change them in place. What a branch
+    of the function decided at the first call stays decided, and a branch on a tensor's value is refused. No gradient
+    flows out of what is returned; on a GPU it is valid until the next call.
 
     Args:
-        function: of tensors, TensorDicts and modules.
-        mode: as of ``torch.compile``; ``"reduce-overhead"`` replays CUDA graphs, so that a GPU does not
-            wait for Python, and what a call returns is valid until the next call.
-        cpp: call the kernels from C++ in place of Python, for a ``function`` on CPU that is many small ones;
-            without ``mode``.
+        function: of nested containers of tensors and constants, TensorDicts among them.
+        name: of what is compiled, for the log.
+        cpp: call the kernels from C++ in place of Python, on a CPU: for many small ones.
+
+    Attributes:
+        graphs: the compiled graphs, by the form of their arguments.
+
+    Raises:
+        RuntimeError: in a call, the function branches on the value of a tensor.
 
     Examples:
         >>> import torch
-        >>> from saferl.modules import compiled
-        >>> compiled(torch.sin)(torch.zeros(2))
-        tensor([0., 0.])
+        >>> from saferl.modules import Compiled
+        >>> sine = Compiled(torch.sin, "the sine")
+        >>> sine(torch.zeros(2)), sine(torch.zeros(2)), len(sine.graphs)
+        (tensor([0., 0.]), tensor([0., 0.]), 1)
     """
-    options = {"cpp_wrapper": True} if cpp else None
-    fast = torch.compile(function, dynamic=False, mode=mode, options=options)
 
-    def quietly(*args, **kwargs):
-        with warnings.catch_warnings():  # at the first call, or at a later one with another shape
-            warnings.filterwarnings("ignore", module="tensordict|torch._dynamo")
-            return fast(*args, **kwargs)
+    def __init__(self, function: Callable, name: str, cpp: bool = False):
+        self.function, self.name, self.cpp = function, name, cpp
+        self.graphs: dict[Any, Callable[[list[Tensor]], Any]] = {}
 
-    return quietly
+    @torch.no_grad()
+    def __call__(self, *args: Any) -> Any:
+        leaves, structure = tree_flatten(args)
+        # Another object for each argument, or the graph would read one of two that are the same twice.
+        tensors = [leaf.detach() for leaf in leaves if isinstance(leaf, Tensor)]
+        form = (
+            structure,
+            *(
+                (leaf.shape, leaf.stride(), leaf.dtype, leaf.device)
+                if isinstance(leaf, Tensor)
+                else leaf
+                for leaf in leaves
+            ),
+        )
+        if form not in self.graphs:
+            self.graphs[form] = self._compile(leaves, structure, tensors)
+        return self.graphs[form](tensors)
+
+    def _compile(self, leaves: list, structure: Any, tensors: list[Tensor]) -> Callable:
+        begin = time.perf_counter()
+        log.info("Compiling %s.", self.name)
+        returned: list[Any] = []
+
+        def flat(tensors: list[Tensor]) -> list[Tensor]:
+            given = iter(tensors)
+            args = [next(given) if isinstance(leaf, Tensor) else leaf for leaf in leaves]
+            with torch.enable_grad():
+                returned[:] = tree_flatten(self.function(*tree_unflatten(args, structure)))
+            return [leaf.detach() for leaf in returned[0] if isinstance(leaf, Tensor)]
+
+        with torch.random.fork_rng():
+            graph = make_fx(flat)(tensors)
+        values, form = returned
+        constants = {i: x for i, x in enumerate(values) if not isinstance(x, Tensor)}
+        count = len(values)
+        del values
+        returned.clear()
+        cuda = any(tensor.is_cuda for tensor in tensors)
+        options = {
+            "fallback_random": True,
+            # A GPU would wait for Python between many small kernels.
+            "triton.cudagraphs": cuda,
+            "cpp_wrapper": self.cpp and not cuda,
+        }
+        fast = torch.compile(graph, fullgraph=True, dynamic=False, options=options)
+
+        def run(tensors: list[Tensor]) -> Any:
+            given = iter(fast(tensors))
+            leaves = [constants[i] if i in constants else next(given) for i in range(count)]
+            return tree_unflatten(leaves, form)
+
+        with torch.random.fork_rng():
+            run(tensors)
+        log.info("Compiled %s in %.0f s.", self.name, time.perf_counter() - begin)
+        return run

@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
-from torch.utils._pytree import tree_map_only
+from torch.utils._pytree import register_pytree_node, tree_map_only
 from torchrl.modules import ValueOperator
 
 #: What may be made of the values of an ensemble's members, [n, *B, 1] -> [*B, 1].
@@ -222,6 +222,14 @@ class BoundCritics:
         return replace(
             self, scenes=tree_map_only((Tensor, TensorDictBase), lambda x: x.detach(), self.scenes)
         )
+
+
+# Compiled code tells apart what the critics know of the states and how they use it.
+register_pytree_node(
+    BoundCritics,
+    lambda bound: ([bound.scenes], (bound.value, bound.stacked, bound.reduce)),
+    lambda scenes, rest: BoundCritics(rest[0], *scenes, *rest[1:]),
+)
 
 
 class CriticEnsemble(TensorDictModuleBase):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,9 +10,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from saferl.modules.compiling import compiled
-
-log = logging.getLogger(__name__)
+from saferl.modules.compiling import Compiled
+from saferl.modules.critics import BoundCritics
 
 #: Steps between two looks at whether any sample still moves, in compiled code.
 _TOGETHER = 10
@@ -109,11 +106,8 @@ def _descend(
     return at
 
 
-@functools.cache
-def _compiled(cpp: bool) -> tuple[Callable, Callable]:
-    """The two functions compiled, once for the process; see :func:`project` on what compiles them anew."""
-    log.info("Compiling the projection at its first use: this takes about a minute.")
-    return compiled(_evaluate, cpp=cpp), compiled(_descend, cpp=cpp)
+_compiled_evaluate = Compiled(_evaluate, "the risk and its gradient", cpp=True)
+_compiled_descend = Compiled(_descend, "the projection", cpp=True)
 
 
 def project(
@@ -166,15 +160,16 @@ def project(
         low: lower end of the box, of all coordinates or of each [A].
         high: upper end of the box, likewise.
         compile: whether to compile the steps, several of them into one function, anew for each shape of
-            ``action`` and each setting; beyond a few of them (torch's ``recompile_limit``) the rest run
-            as they are. The result is the same up to rounding.
+            ``action`` and each setting. The risk is then :class:`BoundCritics`, whose tensors the compiled code
+            is given. The result is the same up to rounding.
 
     Returns:
         A :class:`ProjectionResult`, detached.
 
     Raises:
         ValueError: if ``steps < 0``, ``step_size <= 0``, ``penalty < 0``, ``low >= high``, ``keep``
-            is unknown, ``limit`` is NaN, or the risk's shape does not fit the action's.
+            is unknown, ``limit`` is NaN, ``compile`` is set for another risk, or the risk's shape does not
+            fit the action's.
         RuntimeError: in inference mode, where nothing can be differentiated.
 
     Examples:
@@ -189,14 +184,13 @@ def project(
     start = action.detach()
     evaluate, descend, together = _evaluate, _descend, 1
     if compile:
-        (evaluate, descend), together = _compiled(start.device.type == "cpu"), _TOGETHER
+        if not isinstance(risk_fn, BoundCritics):
+            raise ValueError(f"compile=True needs BoundCritics as risk_fn, got {risk_fn!r}.")
+        evaluate, descend, together = _compiled_evaluate, _compiled_descend, _TOGETHER
     risk_before, slope = evaluate(risk_fn, start)
     none = torch.zeros_like(risk_before, dtype=torch.int64)
     risky = risk_before > limit
-    # Copies, as compiled code is made anew for inputs that are one tensor.
-    at = _Descent(
-        start.clone(), slope, risk_before, risky, none, start.clone(), risk_before.clone()
-    )
+    at = _Descent(start, slope, risk_before, risky, none, start, risk_before)
     for done in range(0, steps, together):
         # To ask a GPU would be to wait for it.
         if start.device.type == "cpu" and not at.active.any():

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -30,8 +29,7 @@ from saferl.envs.intersection.spawning import (
     sense,
 )
 from saferl.envs.intersection.traffic import Vehicles, accelerate, move, road_rules, vehicle_states
-
-log = logging.getLogger(__name__)
+from saferl.modules import Compiled
 
 State = dict[str, Tensor]
 _VEHICLE, _LANE, _OWN = "vehicle_", "lane_", "own_"
@@ -221,17 +219,6 @@ def advance(scenario: Scenario, state: State, action: Tensor) -> tuple[State, St
     }  # fmt: skip
 
 
-def _compiled(function: Callable) -> Callable:
-    """Compiled with static shapes, the numbers of a scenario among its constants."""
-    compiled = torch.compile(function, fullgraph=True, dynamic=False)
-
-    def run(*args):
-        with torch._dynamo.config.patch(specialize_float=True, recompile_limit=64):
-            return compiled(*args)
-
-    return run
-
-
 class BatchedIntersection(IntersectionBase):
     """The CMDP with traffic, B environments in one set of tensors, on CPU or GPU.
 
@@ -245,7 +232,7 @@ class BatchedIntersection(IntersectionBase):
 
     >>> env = BatchedIntersection(Scenario(task="lt"), num_envs=3)
     >>> env.rollout(4)["next", "vehicles"].shape
-    torch.Size([3, 4, 11, 13])
+    torch.Size([3, 4, 11, 14])
     """
 
     def __init__(
@@ -257,12 +244,10 @@ class BatchedIntersection(IntersectionBase):
         compile_physics: bool = False,
     ):
         super().__init__(scenario, num_envs, seed, device)
+        self._advance, self._restart = partial(advance, scenario), partial(restart, scenario)
         if compile_physics:
-            log.info(
-                "Compiling the simulation at its first step: about a minute, a few seconds the next time."
-            )
-        self._advance = _compiled(advance) if compile_physics else advance
-        self._restart = _compiled(restart) if compile_physics else restart
+            self._advance = Compiled(self._advance, "the simulation's step")
+            self._restart = Compiled(self._restart, "the simulation's reset")
         # So many environments are reset at a time that a step in which a few episodes end is not
         # charged for all of them.
         self._chunk = max(min(num_envs, 32), num_envs // 8)
@@ -279,13 +264,13 @@ class BatchedIntersection(IntersectionBase):
             self._state = scenes_last(begin(self.scenario, seeds))
         order = reset.to(torch.int8).argsort(descending=True, stable=True)
         for rows in order.split(self._chunk)[: -(-int(reset.sum()) // self._chunk)]:
-            self._state = self._restart(self.scenario, self._state, seeds, reset, rows)
+            self._state = self._restart(self._state, seeds, reset, rows)
         no = torch.zeros_like(reset)
         return self._output(self._observation() | dict.fromkeys(OUTCOMES, no))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].to(self._state["ego"])
-        self._state, output = self._advance(self.scenario, self._state, action)
+        self._state, output = self._advance(self._state, action)
         return self._output(self._observation() | output)
 
     def snapshot(self, index: int) -> tuple[np.ndarray, np.ndarray]:

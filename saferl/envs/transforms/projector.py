@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import functools
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -16,7 +16,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
-from saferl.modules.compiling import compiled
+from saferl.modules.compiling import Compiled
 from saferl.modules.projection import project
 
 _STASH = "_safety_projection"
@@ -43,11 +43,6 @@ def _risk_of_action(
     else:
         of_action = bind(inputs).detach()
     return of_action, of_action(action).reshape(-1)
-
-
-@functools.cache
-def _compiled_risk(cpp: bool) -> Callable:
-    return compiled(_risk_of_action, cpp=cpp)
 
 
 class SafetyProjector(Transform):
@@ -138,7 +133,14 @@ class SafetyProjector(Transform):
         }
         # Refuses bad settings now and not in the middle of a run.
         project(lambda action: action.sum(-1), torch.zeros(0, 1), self.limit, **self.settings)
+        if compile and not hasattr(risk, "bind"):
+            raise ValueError(
+                f"compile=True needs a risk with bind(), as CriticEnsemble, got {risk}."
+            )
         self.settings["compile"] = compile
+        self._look = partial(_risk_of_action, risk, action_key)
+        if compile:
+            self._look = Compiled(self._look, "the projector's look at a state", cpp=True)
         self.latencies = deque[float](maxlen=10_000)
         self.start = float(start)
         self.action_key = action_key
@@ -154,13 +156,6 @@ class SafetyProjector(Transform):
     def set_progress(self, fraction: float) -> None:
         """Switches the correction on once ``fraction`` of the run is at least ``start``."""
         self.enabled = fraction >= self.start
-
-    def _look(self, inputs: TensorDictBase) -> tuple[Callable[[Tensor], Tensor], Tensor]:
-        """What :func:`_risk_of_action` makes of the states and actions in ``inputs`` [N]."""
-        look = _risk_of_action
-        if self.settings["compile"]:
-            look = _compiled_risk(inputs.get(self.action_key).device.type == "cpu")
-        return look(self.risk, self.action_key, inputs)
 
     def _in_parts(self, risky: Tensor) -> Sequence[Tensor | slice]:
         """The rows to correct, a slice where these are all. A GPU corrects all at once, where the
