@@ -13,7 +13,6 @@ from torch import Tensor
 
 from saferl.modules.mmam import (
     _MASKED,
-    BELOW_GELU,
     MMAMPolicyEncoder,
     MMAMValue,
     _EgoAttention,
@@ -94,13 +93,9 @@ class PlainMMAMValue(MMAMValue):
         )
 
         ego_token, vehicle_tokens = tokens[..., :1, :], tokens[..., 1:-1, :]
-        there = present[..., 1:, None]
-        if self.pair is None:
-            pooled = (vehicle_tokens * there).sum(-2) / there.sum(-2).clamp(min=1.0)
-        else:
-            rest = [x.expand_as(vehicle_tokens) for x in (ego_token, action_token)]
-            pairs = F.gelu(self.pair(torch.cat([vehicle_tokens, *rest], dim=-1)))
-            pooled = largest(pairs, there, BELOW_GELU)
+        rest = [x.expand_as(vehicle_tokens) for x in (ego_token, action_token)]
+        pairs = self.pair(torch.cat([vehicle_tokens, *rest], dim=-1))
+        pooled = F.gelu(largest(pairs, present[..., 1:, None]))
         parts = [ego_token.squeeze(-2), action_token.squeeze(-2), pooled]
         y_mlp = self._activate(self.joint(torch.cat(parts, dim=-1)))
         for layer in self.layers:

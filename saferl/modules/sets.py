@@ -39,9 +39,8 @@ class _PooledScene(nn.Module):
         ego = scale_ego(ego, self.ego_scale)
         features, present = scale_vehicles(vehicles, self.vehicle_scale)
         rows = flat_linear(features, self.vehicle.weight, self.vehicle.bias)
-        rows = F.relu(rows + self.ego(ego).unsqueeze(-2))
-        # What is absent is 0, as is the least of a ReLU: an empty road needs no exception.
-        pooled = largest(rows, present.unsqueeze(-1), 0.0)
+        # What the ego adds is the same for all vehicles, and a ReLU keeps their order.
+        pooled = F.relu(largest(rows, present.unsqueeze(-1)) + self.ego(ego))
         return torch.cat([ego, pooled], dim=-1)
 
 

@@ -21,13 +21,13 @@ from saferl.modules import (
 WIDTH, HEADS = 16, 4
 SCALES = ["paper", "per_head"]
 FORMS = [
-    (kind, {name: value})
-    for name, values, kinds in (
-        ("keys", ("attended", "embedded"), (MMAMPolicyEncoder, PlainMMAMPolicyEncoder)),
-        ("branch", ("vehicle", "scene"), (MMAMValue, PlainMMAMValue)),
-    )
-    for value in values
-    for kind in kinds
+    *(
+        (kind, {"keys": keys})
+        for keys in ("attended", "embedded")
+        for kind in (MMAMPolicyEncoder, PlainMMAMPolicyEncoder)
+    ),
+    (MMAMValue, {}),
+    (PlainMMAMValue, {}),
 ]
 
 
@@ -93,14 +93,10 @@ def plain_value(net, ego, vehicles, action, scale):
     z_action = F.gelu(net.action(action)).unsqueeze(0)
     z_2 = torch.cat([z_ego, z_sv, z_action])
     y_attn = multi_head(z_ego, z_2, *weights_of(net.attention), scale)
-    if net.pair is None:
-        pooled = sum((row / len(z_sv) for row in z_sv), torch.zeros_like(z_ego))
-    else:
-        pooled = torch.full((1, net.pair.out_features), -1.0, dtype=ego.dtype)
-        for row in z_sv:
-            row = F.gelu(net.pair(torch.cat([row, z_ego[0], z_action[0]])))
-            pooled = torch.maximum(pooled, row)
-    y_mlp = F.gelu(net.joint(torch.cat([z_ego, z_action, pooled], dim=-1)))
+    pairs = [net.pair(torch.cat([row, z_ego[0], z_action[0]])) for row in z_sv]
+    # Without any SV what the action and the EV add has nothing to be added to.
+    pooled = F.gelu(torch.stack(pairs).amax(0)) if pairs else torch.zeros(WIDTH).to(ego)
+    y_mlp = F.gelu(net.joint(torch.cat([z_ego, z_action, pooled.unsqueeze(0)], dim=-1)))
     for layer in net.layers:
         y_mlp = F.gelu(layer(y_mlp))
     return (y_attn @ net.w_attn.weight.T + y_mlp @ net.w_mlp.weight.T).squeeze(0)
@@ -240,10 +236,6 @@ def test_errors(kind, options, message):
 def test_unknown_forms_are_refused():
     with pytest.raises(ValueError, match="keys must be 'attended' or 'embedded', got 'both'"):
         MMAMPolicyEncoder(16, keys="both")
-    with pytest.raises(ValueError, match="branch must be 'vehicle' or 'scene', got 'token'"):
-        MMAMValue(16, branch="token")
-    with pytest.raises(ValueError, match='pair_width is of branch="vehicle", got 8 with "scene"'):
-        MMAMValue(16, branch="scene", pair_width=8)
     with pytest.raises(ValueError, match="outputs must be >= 1, got 0"):
         MMAMValue(16, outputs=0)
 
