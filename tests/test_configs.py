@@ -130,7 +130,7 @@ def test_critics_are_built_as_their_options_say(encoder: str):
     for option in ("critic.layer_norm=true", "cost_critic.layer_norm=true"):
         assert sum(critic.layer_norm for critic in critics(option)) == 1
     plain, quantiles = critics("cost_critic=quantile")
-    scene = torch.zeros(3, 17), torch.zeros(3, 11, 13), torch.zeros(3, 2)
+    scene = torch.zeros(3, 17), torch.zeros(3, 11, 14), torch.zeros(3, 2)
     assert plain(*scene).shape == (3, 1) and quantiles(*scene).shape == (3, 16)
 
 

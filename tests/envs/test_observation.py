@@ -295,6 +295,26 @@ def nearest_on(line, x, y):
     return poses[index].tolist(), float(s[index])
 
 
+def turned_path(x, y, heading, pace, omega, times):
+    """Places at ``times`` of a car that turns until its heading is along an arm, in steps of 1 ms."""
+    places, step = [], 1e-3
+    arms = [k * math.pi / 2 for k in range(-12, 13)]
+    end = (
+        min((arm for arm in arms if arm > heading), default=0)
+        if omega > 0
+        else max(arm for arm in arms if arm < heading)
+    )
+    for number in range(round(times[-1] / step) + 1):
+        if any(abs(number * step - time) < step / 2 for time in times):
+            places.append((x, y))
+        turn = omega * step if abs(omega) > 0.05 else 0.0
+        turn = min(turn, end - heading) if omega > 0 else max(turn, end - heading)
+        x += pace * step * math.cos(heading + turn / 2)
+        y += pace * step * math.sin(heading + turn / 2)
+        heading += turn
+    return places
+
+
 def looped_route(ego, vehicles, present, route, rows):
     """The route's form by plain loops, from the world's and a search along the lines."""
     own, world, nearest = looped(ego, vehicles, present, route, rows)
@@ -312,14 +332,14 @@ def looped_route(ego, vehicles, present, route, rows):
     one_hot = [float(route == k) for k in range(4)]
     features = [*ego[2:4], ego[5], *offsets, *headings, *ahead, start - 100.0, *one_hot, *own[-2:]]
 
-    table = np.zeros((rows, 13))
+    table = np.zeros((rows, 14))
     turn = complex(math.cos(ego[4]), -math.sin(ego[4]))
     for row, index in enumerate(nearest):
         place = complex(*world[row, 1:3]) * turn
         speed = complex(*world[row, 3:5]) * turn
         angle = vehicles[index][4] - ego[4]
         where, when = REACH, PATIENCE
-        x, y, pace, _, heading, _ = vehicles[index]
+        x, y, pace, _, heading, omega = vehicles[index]
         for step in np.arange(0.0, REACH, 2.5):
             point = line_pose(lines[0], torch.tensor(start + step).double())
             way = complex(float(point[0]) - x, float(point[1]) - y)
@@ -328,13 +348,12 @@ def looped_route(ego, vehicles, present, route, rows):
                 where, when = step, min(max((way.real - 2.5) / max(pace, 1.0), 0.0), PATIENCE)
                 break
         lead = min(max(where / max(ego[2], 1.0) - when, -PATIENCE), PATIENCE)
-        gaps = []
-        for time in np.arange(0.0, HORIZON + 0.1, 0.25):
+        gaps, times = [], np.arange(0.0, HORIZON + 0.1, 0.25)
+        for time, at in zip(times, turned_path(x, y, heading, pace, omega, times), strict=True):
             point = line_pose(lines[0], torch.tensor(start + ego[2] * time).double())
-            gaps.append(math.dist(point[:2].tolist(), (x + pace * time * math.cos(heading),
-                                                       y + pace * time * math.sin(heading))))  # fmt: skip
+            gaps.append(math.dist(point[:2].tolist(), at))
         table[row] = [1, place.real, place.imag, speed.real, speed.imag, math.sin(angle),
-                      math.cos(angle), 10 / (5 + abs(place)), where, when, lead, min(gaps),
+                      math.cos(angle), omega, 10 / (5 + abs(place)), where, when, lead, min(gaps),
                       0.25 * int(np.argmin(gaps))]  # fmt: skip
     return np.array(features), table, nearest
 
@@ -368,7 +387,7 @@ def test_the_route_form_equals_a_loop(rows):
         np.testing.assert_allclose(ours[0].numpy(), own, atol=0.012)  # the search's centimetre
         # A corridor's edge may lie within that centimetre: there the first meeting is another one.
         same = np.isclose(ours[1].numpy(), table, atol=0.015)
-        assert same[:, :8].all() and same[:, 11].all() and same[:, 8:].mean() > 0.98
+        assert same[:, :9].all() and same[:, 12].all() and same[:, 9:].mean() > 0.98
         assert ours[2].nonzero().flatten().tolist() == sorted(nearest)
 
 

@@ -36,6 +36,7 @@ _SPACING = 2.5  # m between the points of the line that it may cross
 _CORRIDOR = 2.5  # m to either side of its way
 #: For how long both are played on, and in what steps, to find when they are closest: s.
 HORIZON, _STEP = 4.0, 0.25
+_TURNING = 0.05  # rad/s, of a vehicle that turns
 _RADIUS = math.hypot(LENGTH / 4, WIDTH / 2)
 #: The seam of a vehicle's heading is on no lane's direction.
 _SEAM = 0.75 * math.pi
@@ -78,11 +79,12 @@ FORMS = {
             "x": 20.0, "y": 20.0,  # m ahead of the ego and to its right
             "v_x": 10.0, "v_y": 10.0,  # m/s likewise, relative to the ego's
             "sin": 1.0, "cos": 1.0,  # of its heading against the ego's
+            "omega": 1.0,  # rad/s, its yaw rate
             "near": 1.0,  # 10 m / (5 m + distance)
             "conflict_s": 20.0,  # m along the own line to where its way first meets it
             "conflict_t": 4.0,  # s until it is there
             "lead": 4.0,  # s that the ego is there later
-            "closest": 10.0,  # m between both centres when they are closest, at their speeds of now
+            "closest": 10.0,  # m between both centres when they are closest, at their speeds and turns of now
             "closest_t": 4.0,  # s until then
         },
     ),
@@ -162,14 +164,16 @@ def _conflict(
 def _closest(
     x: Tensor,
     y: Tensor,
-    cos: Tensor,
-    sin: Tensor,
+    heading: Tensor,
     speed: Tensor,
+    omega: Tensor,
     line: Tensor,
     s: Tensor,
     own: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """How close vehicles that go straight on come to an ego that follows its line at ``own`` m/s, and when.
+    """How close vehicles come to an ego that follows its line at ``own`` m/s, and when.
+
+    A vehicle that turns goes on turning until it drives along one of the arms, then straight on.
 
     Returns:
         Metres between centres and seconds, [N, ...].
@@ -177,8 +181,17 @@ def _closest(
     times = torch.arange(0.0, HORIZON + _STEP, _STEP, dtype=s.dtype, device=s.device)
     times = times.reshape(-1, *[1] * s.ndim)
     points = line_pose(line.expand(len(times), *line.shape), s + own * times)[:, None]
-    ahead = speed * times[:, None]  # [K, N, ...]
-    gap = torch.hypot(points[..., 0] - x - ahead * cos, points[..., 1] - y - ahead * sin)
+    times = times[:, None]  # [K, 1, ...]
+    # The rest of its turn, and the time that it takes.
+    turned = torch.remainder(heading * omega.sign(), math.pi / 2)
+    rest = torch.where(omega.abs() > _TURNING, math.pi / 2 - turned, 0.0)
+    turning = torch.minimum(times, rest / omega.abs().clamp_min(_TURNING))
+    half = 0.5 * omega * turning
+    chord = speed * turning * torch.sinc(half / math.pi)
+    straight, last = speed * (times - turning), heading + 2.0 * half
+    path_x = x + chord * torch.cos(heading + half) + straight * torch.cos(last)
+    path_y = y + chord * torch.sin(heading + half) + straight * torch.sin(last)
+    gap = torch.hypot(points[..., 0] - path_x, points[..., 1] - path_y)
     least, when = gap.min(0)
     return least, when.to(s) * _STEP
 
@@ -208,7 +221,7 @@ def observe(
         lies in [-3 pi / 4, 5 pi / 4).
     """
     # Vehicles come first here, [N, ...].
-    x, y, v_x, v_y, heading, _ = vehicles.movedim(-2, 0).unbind(-1)
+    x, y, v_x, v_y, heading, yaw_rate = vehicles.movedim(-2, 0).unbind(-1)
     own_x, own_y, own_v_x, own_v_y, phi, omega = ego.unbind(-1)
     cos, sin = torch.cos(phi), torch.sin(phi)
     dx, dy = x - own_x, y - own_y
@@ -258,11 +271,12 @@ def observe(
             (v_x * turn_sin + v_y * turn_cos) - own_v_y,
             turn_sin,
             turn_cos,
+            yaw_rate,
             10.0 / (5.0 + gap),
         ]
         where, when = _conflict(x, y, v_cos, v_sin, v_x, lines[0], s[0])
         lead = (where / own_v_x.clamp_min(1.0) - when).clamp(-PATIENCE, PATIENCE)
-        close = _closest(x, y, v_cos, v_sin, v_x, lines[0], s[0], own_v_x)
+        close = _closest(x, y, heading, v_x, yaw_rate, lines[0], s[0], own_v_x)
         features += [where, when, lead, *close]
     places = torch.arange(rows, device=x.device).reshape(-1, *[1] * x.ndim)
     here = (places == row) & seen  # [M, N, ...]
@@ -272,7 +286,7 @@ def observe(
 
 
 def as_world(ego: Tensor, vehicles: Tensor) -> tuple[Tensor, Tensor]:
-    """An observation of either form as one of ``world``: the two hold the same.
+    """An observation of either form as one of ``world``, which knows no yaw rate but the ego's.
 
     Args:
         ego: [..., F].
