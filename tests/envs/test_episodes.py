@@ -65,6 +65,9 @@ def test_route_starts_spread_their_share_along_the_route(share):
         place = ((s - 65.0) / (goal - 65.0))[beyond].sort().values
         uniform_place = (torch.arange(len(place)) + 0.5) / len(place)
         assert (place - uniform_place).abs().max() < 0.05
+        # Those along the route begin at any speed, at rest too.
+        speed = (state[beyond, 2] / 10.0).sort().values
+        assert (speed - uniform_place).abs().max() < 0.05
 
 
 # --- ends of episodes ----------------------------------------------------------------------------

@@ -126,7 +126,8 @@ def draw_route(task: str, seed: Tensor) -> Tensor:
 
 def draw_start(route: Tensor, seed: Tensor, route_starts: float) -> Tensor:
     """Start states [..., 6] float64: 40 +- 5 m before the box at U[6, 10] m/s, or, for the share
-    ``route_starts`` of the seeds, anywhere between there and the goal."""
+    ``route_starts`` of the seeds, anywhere between there and the goal at U[0, 10] m/s: who has always
+    driven does not know how to move off."""
     anywhere = uniform(seed, 2) < route_starts
     before = ARM - 40.0 + 10.0 * (uniform(seed, 3) - 0.5)
     lines = reference_lines(route, before)[..., 0, :, :]
@@ -134,7 +135,8 @@ def draw_start(route: Tensor, seed: Tensor, route_starts: float) -> Tensor:
     first = ARM - 45.0
     s = torch.where(anywhere, first + (past - first) * uniform(seed, 3), before)
     x, y, phi = line_pose(lines, s).unbind(-1)
-    speed = 6.0 + 4.0 * uniform(seed, 4)
+    slowest = torch.where(anywhere, 0.0, 6.0)
+    speed = slowest + (10.0 - slowest) * uniform(seed, 4)
     zero = torch.zeros_like(x)
     return columns(x, y, speed, zero, phi, zero)
 
