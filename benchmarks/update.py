@@ -97,7 +97,8 @@ def transitions(batch: int, device: str) -> TensorDict:
 
 def learner(overrides: list[str], device: str, compile: bool) -> Learner:
     with initialize_config_dir(config_dir(), version_base=None):
-        cfg = compose("config", [*overrides, f"device={device}", f"compile={compile}"])
+        fixed = ["task.observation=world", f"device={device}", f"compile={compile}"]
+        cfg = compose("config", [*overrides, *fixed])
     torch.manual_seed(0)
     return build_learner(cfg, build_agent(cfg).loss)
 

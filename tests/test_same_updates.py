@@ -77,7 +77,7 @@ def losses_and_gradients(learner: Learner) -> tuple[torch.Tensor, dict[str, torc
 
 FORMS = [
     pytest.param({}, (), id="keys by default"),
-    pytest.param({}, ("encoder.policy.keys=embedded",), id="others"),
+    pytest.param({}, ("encoder.policy.keys=attended",), id="others"),
     pytest.param({"compile": True}, (), id="compiled", marks=pytest.mark.slow),
 ]
 

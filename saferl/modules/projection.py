@@ -14,7 +14,7 @@ from saferl.modules.compiling import Compiled
 from saferl.modules.critics import BoundCritics
 
 #: Steps between two looks at whether any sample still moves, in compiled code.
-_TOGETHER = 10
+_TOGETHER = 5
 
 
 @dataclass(frozen=True)
