@@ -27,6 +27,7 @@ from saferl.envs.transforms import ExecutedAction
 from saferl.experience import Epochs, Replay
 from saferl.hooks import ProjectorProgress
 from saferl.learner import Learner
+from saferl.modules import HeldActions
 from saferl.progress import Budget
 from saferl.trainer import Trainer
 from saferl.validation import arguments, check_targets, check_training
@@ -250,9 +251,15 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         transforms.append(agent.projector)
     num_envs = cfg.env.num_envs
     env = build_env(cfg, scenario, num_envs, cfg.seed, *transforms)
+    policy: Any = agent.actor
+    if cfg.get("exploration", 0.0) and not on_policy(
+        cfg
+    ):  # a run from before this setting has none
+        explore = HeldActions(env.action_spec, cfg.exploration, cfg.exploration_hold)
+        policy = TensorDictSequential(policy, explore.to(device_of(cfg)))
     collector = Collector(
         env,
-        agent.actor,
+        policy,
         frames_per_batch=cfg.collector.frames_per_env * num_envs,
         total_frames=-1,
         init_random_frames=0 if cfg.init or on_policy(cfg) else cfg.warmup_frames,

@@ -44,6 +44,8 @@ TRAINING = {
     "target_entropy": (Literal["auto"] | float, -math.inf, math.inf),
     "alpha_init": (float, 0, math.inf),
     "initial_std": (float, 0.02, math.inf),
+    "exploration": (float, 0, 1),
+    "exploration_hold": (int, 1, math.inf),
     "multiplier_lr": (float, 0, math.inf),
     "record_every": (int, 1, math.inf),
     "save_every": (int, 1, math.inf),

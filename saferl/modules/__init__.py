@@ -9,6 +9,7 @@ from saferl.modules.critics import (
     value_operator,
     zero_output,
 )
+from saferl.modules.exploration import HeldActions
 from saferl.modules.lagrange import DualAscent, LagrangeMultiplier, PIDMultiplier
 from saferl.modules.mlp import MLPPolicyEncoder, MLPValue
 from saferl.modules.mmam import EGO_SCALE, VEHICLE_SCALE, MMAMPolicyEncoder, MMAMValue
@@ -26,6 +27,7 @@ __all__ = [
     "CriticEnsemble",
     "DualAscent",
     "GaussianHead",
+    "HeldActions",
     "LagrangeMultiplier",
     "Largest",
     "MLPPolicyEncoder",

@@ -51,6 +51,10 @@ class Compiled:
         self.function, self.name, self.cpp = function, name, cpp
         self.graphs: dict[Any, Callable[[list[Tensor]], Any]] = {}
 
+    def __getstate__(self) -> dict[str, Any]:
+        # A graph reads the tensors of this object's function; a copy makes its own.
+        return {**self.__dict__, "graphs": {}}
+
     @torch.no_grad()
     def __call__(self, *args: Any) -> Any:
         leaves, structure = tree_flatten(args)

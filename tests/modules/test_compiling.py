@@ -1,6 +1,8 @@
 """A function as a graph of its own: values, forms, random numbers, and what is read where it is."""
 
 import functools
+import pickle
+from copy import deepcopy
 
 import pytest
 import torch
@@ -86,6 +88,17 @@ def test_a_branch_on_a_value_is_refused():
     compiled = Compiled(lambda x: x if x.sum() > 0 else -x, "a branch")
     with pytest.raises(RuntimeError, match="value"):
         compiled(torch.ones(2))
+
+
+def test_a_copy_reads_its_own_tensors():
+    layer = torch.nn.Linear(2, 2)
+    compiled = Compiled(layer, "a layer")
+    compiled(torch.ones(1, 2))
+    for copy in (deepcopy(compiled), pickle.loads(pickle.dumps(compiled))):
+        with torch.no_grad():
+            copy.function.weight.zero_(), copy.function.bias.fill_(3.0)
+        assert copy(torch.ones(1, 2)).tolist() == [[3.0, 3.0]]
+    torch.testing.assert_close(compiled(torch.ones(1, 2)), layer(torch.ones(1, 2)).detach())
 
 
 def test_each_owns_its_graphs(backend):
