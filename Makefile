@@ -5,7 +5,7 @@ STAMP := $(VENV)/.installed
 # One thread for each process: two that fight over the cores are slower than one.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: setup train test slow lint
+.PHONY: setup train test slow lint gpu
 
 setup: $(STAMP)
 
@@ -23,6 +23,9 @@ test: setup
 
 slow: setup
 	$(BIN)/python -m pytest -m slow -q
+
+gpu: setup
+	$(BIN)/python benchmarks/gpu.py $(or $(OUT),gpu)
 
 lint: setup
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright
