@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule, SoftUpdate
 
-from saferl.modules import Compiled
+from saferl.compiling import Compiled
 
 #: Names of the parameter groups that step together, one after the other.
 ORDERS = {

@@ -72,12 +72,12 @@ def test_the_walk_sees_the_package():
 @pytest.mark.parametrize("name", of("envs"))
 def test_envs_import_nothing_else_and_transforms_only_modules(name):
     allowed = {"modules"} if name.startswith("saferl.envs.transforms") else set()
-    assert {part(target) for target in foreign(name)} <= allowed
+    assert {part(target) for target in foreign(name)} <= allowed | {"compiling"}
 
 
 @pytest.mark.parametrize("name", of("modules"))
 def test_modules_import_nothing_else(name):
-    assert foreign(name) == set()
+    assert {part(target) for target in foreign(name)} <= {"compiling"}
 
 
 @pytest.mark.parametrize("name", of("objectives"))

@@ -1,7 +1,6 @@
 """Networks, critics, multipliers and the projection that algorithms are composed of."""
 
 from saferl.modules.actors import GaussianHead, tanh_gaussian_actor
-from saferl.modules.compiling import Compiled
 from saferl.modules.critics import (
     BoundCritics,
     CriticEnsemble,
@@ -23,7 +22,6 @@ __all__ = [
     "VEHICLE_SCALE",
     "BoundCritics",
     "CVaR",
-    "Compiled",
     "CriticEnsemble",
     "DualAscent",
     "GaussianHead",

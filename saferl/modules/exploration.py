@@ -13,33 +13,32 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 class HeldActions(TensorDictModuleBase):
     """Now and then a random action that is held for a few decisions (Dabney et al., 2021).
 
-        Where one decision changes little, as for a car that stands still, noise on single decisions never shows what
-        another way of driving would bring; a policy that waits for ever then keeps critics that know nothing else.
-        Append it to a policy that collects for an off-policy loss. Outside :attr:`ExplorationType.RANDOM` it does nothing.
+    Where one decision changes little, as for a car that stands still, noise on single decisions never shows what
+    another way of driving would bring; a policy that waits for ever then keeps critics that know nothing else.
+    Append it to a policy that collects for an off-policy loss. Outside :attr:`ExplorationType.RANDOM` it does nothing.
 
-        Args:
-            spec: of the action, with bounds; random ones are uniform in them.
-            share: of all decisions that are random ones.
-            hold: decisions that a random action is held.
-            action_key: the entry of the action.
+    Args:
+        spec: of the action, with bounds; random ones are uniform in them.
+        share: of all decisions that are random ones.
+        hold: decisions that a random action is held.
+        action_key: the entry of the action.
 
-        Reads and writes the action [*B, A], and ``held_action`` [*B, A] and ``held_steps`` [*B, 1] (int64), what is held and for how many
-        more decisions, which a rollout keeps from one step to the next.
+    Reads and writes the action [*B, A], and ``held_action`` [*B, A] and ``held_steps`` [*B, 1] (int64), what is held and for how many
+    more decisions, which a rollout keeps from one step to the next.
 
-        Raises:
-            ValueError: ``share`` is not in [0, 1], ``hold`` is below 1, or the action has no bounds.
+    Raises:
+        ValueError: ``share`` is not in [0, 1], ``hold`` is below 1, or the action has no bounds.
 
-        Examples:
-            >>> import torch
-            >>> from tensordict import TensorDict
-            >>> from torchrl.data import Bounded
-    from torchrl.envs.utils import ExplorationType, exploration_type
-            >>> from saferl.modules import HeldActions
-            >>> explore = HeldActions(Bounded(-1.0, 1.0, (4, 2)), share=1.0, hold=5)
-            >>> data = explore(TensorDict(action=torch.zeros(4, 2), batch_size=4))
-            >>> first = data["action"].clone()
-            >>> bool((explore(data.set("action", torch.zeros(4, 2)))["action"] == first).all())
-            True
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> from saferl.modules import HeldActions
+        >>> explore = HeldActions(Bounded(-1.0, 1.0, (4, 2)), share=1.0, hold=5)
+        >>> data = explore(TensorDict(action=torch.zeros(4, 2), batch_size=4))
+        >>> first = data["action"].clone()
+        >>> bool((explore(data.set("action", torch.zeros(4, 2)))["action"] == first).all())
+        True
     """
 
     def __init__(

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from saferl.compiling import Compiled
 from saferl.envs.intersection.base import (
     OUTCOMES,
     STANDING,
@@ -29,7 +30,6 @@ from saferl.envs.intersection.spawning import (
     sense,
 )
 from saferl.envs.intersection.traffic import Vehicles, accelerate, move, road_rules, vehicle_states
-from saferl.modules import Compiled
 
 State = dict[str, Tensor]
 _VEHICLE, _LANE, _OWN = "vehicle_", "lane_", "own_"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import torch
@@ -16,7 +15,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
-from saferl.modules.compiling import Compiled
+from saferl.compiling import Compiled
 from saferl.modules.projection import project
 
 _STASH = "_safety_projection"
@@ -28,21 +27,6 @@ _REPORT = {
     "intervened": torch.bool,
     "feasible": torch.bool,
 }
-
-
-def _risk_of_action(
-    risk: TensorDictModuleBase, action_key: NestedKey, inputs: TensorDictBase
-) -> tuple[Callable[[Tensor], Tensor], Tensor]:
-    """The risk [N, 1] as a function of the action alone [N, A], and that of the action given [N]."""
-    bind, action = getattr(risk, "bind", None), inputs.get(action_key)
-    if bind is None:
-
-        def of_action(action: Tensor) -> Tensor:
-            return risk(inputs.copy().set(action_key, action)).get(risk.out_keys[0])
-
-    else:
-        of_action = bind(inputs).detach()
-    return of_action, of_action(action).reshape(-1)
 
 
 class SafetyProjector(Transform):
@@ -138,9 +122,9 @@ class SafetyProjector(Transform):
                 f"compile=True needs a risk with bind(), as CriticEnsemble, got {risk}."
             )
         self.settings["compile"] = compile
-        self._look = partial(_risk_of_action, risk, action_key)
+        self._see = self._look
         if compile:
-            self._look = Compiled(self._look, "the projector's look at a state", cpp=True)
+            self._see = Compiled(self._look, "the projector's look at a state", cpp=True)
         self.latencies = deque[float](maxlen=10_000)
         self.start = float(start)
         self.action_key = action_key
@@ -156,6 +140,19 @@ class SafetyProjector(Transform):
     def set_progress(self, fraction: float) -> None:
         """Switches the correction on once ``fraction`` of the run is at least ``start``."""
         self.enabled = fraction >= self.start
+
+    def _look(self, inputs: TensorDictBase) -> tuple[Callable[[Tensor], Tensor], Tensor]:
+        """The risk [N, 1] as a function of the action alone [N, A], and that of the action given [N]."""
+        bind, action = getattr(self.risk, "bind", None), inputs.get(self.action_key)
+        if bind is None:
+
+            def of_action(action: Tensor) -> Tensor:
+                seen = inputs.copy().set(self.action_key, action)
+                return self.risk(seen).get(self.risk.out_keys[0])
+
+        else:
+            of_action = bind(inputs).detach()
+        return of_action, of_action(action).reshape(-1)
 
     def _in_parts(self, risky: Tensor) -> Sequence[Tensor | slice]:
         """The rows to correct, a slice where these are all. A GPU corrects all at once, where the
@@ -195,7 +192,7 @@ class SafetyProjector(Transform):
         inputs = tensordict.select(*self.risk.in_keys).reshape(-1)
         action = inputs.get(self.action_key)
 
-        risk, before = self._look(inputs)
+        risk, before = self._see(inputs)
         executed, after, steps = action.clone(), before.clone(), torch.zeros_like(before)
         parts = self._in_parts(before > self.limit) if self.enabled else []
         if len(parts):
@@ -203,7 +200,7 @@ class SafetyProjector(Transform):
             for rows in parts:
                 # Only the risky samples are worth up to `steps` evaluations.
                 if isinstance(rows, Tensor):
-                    risk, _ = self._look(inputs[rows])
+                    risk, _ = self._see(inputs[rows])
                 result = project(risk, action[rows], self.limit, **self.settings, **self._bounds())
                 executed[rows], after[rows] = result.action, result.risk_after
                 steps[rows] = result.steps.to(steps)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from saferl.modules import Compiled
+from saferl.compiling import Compiled
 
 BACKENDS = ["eager", pytest.param("inductor", marks=pytest.mark.slow)]
 

@@ -41,7 +41,7 @@ class Compiled:
 
     Examples:
         >>> import torch
-        >>> from saferl.modules import Compiled
+        >>> from saferl.compiling import Compiled
         >>> sine = Compiled(torch.sin, "the sine")
         >>> sine(torch.zeros(2)), sine(torch.zeros(2)), len(sine.graphs)
         (tensor([0., 0.]), tensor([0., 0.]), 1)
