@@ -255,8 +255,8 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
     if cfg.get("exploration", 0.0) and not on_policy(
         cfg
     ):  # a run from before this setting has none
-        explore = HeldActions(env.action_spec, cfg.exploration, cfg.exploration_hold)
-        policy = TensorDictSequential(policy, explore.to(device_of(cfg)))
+        explore: Any = HeldActions(env.action_spec, cfg.exploration, cfg.exploration_hold)
+        policy = TensorDictSequential(policy, explore)
     collector = Collector(
         env,
         policy,

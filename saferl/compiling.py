@@ -93,7 +93,7 @@ class Compiled:
         del values
         returned.clear()
         cuda = any(tensor.is_cuda for tensor in tensors)
-        options = {
+        options: dict[str, Any] = {
             "fallback_random": True,
             # A GPU would wait for Python between many small kernels.
             "triton.cudagraphs": cuda,

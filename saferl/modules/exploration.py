@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torchrl.data import Bounded
+from torchrl.data import Bounded, TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 
@@ -42,7 +42,7 @@ class HeldActions(TensorDictModuleBase):
     """
 
     def __init__(
-        self, spec: Bounded, share: float, hold: int = 5, action_key: NestedKey = "action"
+        self, spec: TensorSpec, share: float, hold: int = 5, action_key: NestedKey = "action"
     ):
         super().__init__()
         if not 0.0 <= share <= 1.0:
@@ -55,7 +55,8 @@ class HeldActions(TensorDictModuleBase):
         # `hold` random decisions are followed by (1 - start) / start others.
         self.start = share / (share + hold * (1.0 - share))
         self.hold, self.action_key = hold, action_key
-        self.in_keys, self.out_keys = [action_key], [action_key, "held_action", "held_steps"]
+        keys: list = [action_key]
+        self.in_keys, self.out_keys = keys, [*keys, "held_action", "held_steps"]
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
