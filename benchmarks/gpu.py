@@ -50,13 +50,8 @@ def parts(out: Path, device: str, small: bool) -> dict[str, tuple[float, list[st
         "simulation": (
             100.0,
             [
-                "simulation.py",
-                *on,
-                *rounds,
-                "--batches",
-                *batches,
-                "--json",
-                f"{out}/simulation.json",
+                *("simulation.py", *on, *rounds, "--batches", *batches),
+                *("--json", f"{out}/simulation.json"),
             ],
         ),
         **updates,

@@ -252,9 +252,8 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
     num_envs = cfg.env.num_envs
     env = build_env(cfg, scenario, num_envs, cfg.seed, *transforms)
     policy: Any = agent.actor
-    if cfg.get("exploration", 0.0) and not on_policy(
-        cfg
-    ):  # a run from before this setting has none
+    # A run from before this setting has none.
+    if cfg.get("exploration", 0.0) and not on_policy(cfg):
         explore: Any = HeldActions(env.action_spec, cfg.exploration, cfg.exploration_hold)
         policy = TensorDictSequential(policy, explore)
     collector = Collector(

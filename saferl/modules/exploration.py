@@ -51,10 +51,9 @@ class HeldActions(TensorDictModuleBase):
             raise ValueError(f"hold must be >= 1, got {hold}.")
         if not isinstance(spec, Bounded):
             raise ValueError(f"Random actions need bounds, got {type(spec).__name__}.")
-        self.low, self.high = (end.reshape(-1, end.shape[-1])[0] for end in (spec.low, spec.high))
         # `hold` random decisions are followed by (1 - start) / start others.
         self.start = share / (share + hold * (1.0 - share))
-        self.hold, self.action_key = hold, action_key
+        self.spec, self.hold, self.action_key = spec, hold, action_key
         keys: list = [action_key]
         self.in_keys, self.out_keys = keys, [*keys, "held_action", "held_steps"]
 
@@ -67,7 +66,7 @@ class HeldActions(TensorDictModuleBase):
         left = tensordict.get("held_steps", None)
         left = torch.zeros(shape, dtype=torch.int64, device=action.device) if left is None else left
         begins = (left == 0) & (torch.rand(shape, device=action.device) < self.start)
-        random = self.low + (self.high - self.low) * torch.rand_like(action)
+        random = self.spec.rand(action.shape[: action.ndim - self.spec.ndim])
         held = torch.where(begins, random, tensordict.get("held_action", action))
         left = torch.where(begins, self.hold, left)
         tensordict.set("held_action", held).set("held_steps", (left - 1).clamp_min(0))

@@ -227,8 +227,8 @@ class BatchedIntersection(IntersectionBase):
         num_envs: B.
         seed: of the sequences of episodes.
         device: torch device.
-        compile_physics: compile the step and the reset: several times faster, after half a minute (or a few
-            seconds, once torch has it in its cache on disk).
+        compile_physics: compile the step and the reset: three times faster, after minutes (or seconds,
+            once torch has it in its cache on disk).
 
     >>> env = BatchedIntersection(Scenario(task="lt"), num_envs=3)
     >>> env.rollout(4)["next", "vehicles"].shape
