@@ -10,23 +10,40 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.fx.experimental.proxy_tensor import make_fx
+from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_unflatten
 
 log = logging.getLogger(__name__)
+
+
+class _NoValues(TorchDispatchMode):
+    """Refuses to read the value of a tensor: it would be a constant of the graph."""
+
+    def __init__(self, name: str):
+        super().__init__()
+        self.name = name
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        if func is torch.ops.aten._local_scalar_dense.default:
+            raise RuntimeError(
+                f"{self.name} reads the value of a tensor (a branch on it, float(), item()), which compiled code "
+                "would never read again: keep it a tensor, or do not compile."
+            )
+        return func(*args, **(kwargs or {}))
 
 
 class Compiled:
     """A function as one graph of tensor operations for each form of its arguments, compiled.
 
     The function runs once, on the first arguments of a form, while its operations are written down, the
-    gradients that it takes among them; ``torch.compile`` gets that list. So a loss with hundreds of
-    TensorDict operations compiles in seconds where following its Python takes minutes, and the graphs are this
-    object's own: however many there are in a process, none takes another's place. It draws the random numbers
-    that the function would, so that steps may be compiled or not in turn.
+    gradients that it takes among them; it must change nothing in place. ``torch.compile`` gets that list. So a loss
+    with hundreds of TensorDict operations compiles in seconds where following its Python takes minutes, and the
+    graphs are this object's own: however many there are in a process, none takes another's place. It draws the
+    random numbers that the function would, so that steps may be compiled or not in turn.
 
-    Tensors that are no arguments, such as parameters, are read where they are: change them in place. What a branch
-    of the function decided at the first call stays decided, and a branch on a tensor's value is refused. No gradient
-    flows out of what is returned; on a GPU it is valid until the next call.
+    Tensors that are no arguments, such as parameters, are read where they are: change them in place. All else is as
+    it was at the first call: a number or an attribute that the function looks up, and what it decided by them; to read
+    a tensor's value is refused. No gradient flows out of what is returned; on a GPU it is valid until the next call.
 
     Args:
         function: of nested containers of tensors and constants, TensorDicts among them.
@@ -37,7 +54,7 @@ class Compiled:
         graphs: the compiled graphs, by the form of their arguments.
 
     Raises:
-        RuntimeError: in a call, the function branches on the value of a tensor.
+        RuntimeError: in a call, the function reads the value of a tensor.
 
     Examples:
         >>> import torch
@@ -65,23 +82,28 @@ class Compiled:
             *(
                 (leaf.shape, leaf.stride(), leaf.dtype, leaf.device)
                 if isinstance(leaf, Tensor)
-                else leaf
+                else (type(leaf), leaf)
                 for leaf in leaves
             ),
         )
-        if form not in self.graphs:
-            self.graphs[form] = self._compile(leaves, structure, tensors)
-        return self.graphs[form](tensors)
-
-    def _compile(self, leaves: list, structure: Any, tensors: list[Tensor]) -> Callable:
+        if form in self.graphs:
+            return self.graphs[form](tensors)
         begin = time.perf_counter()
         log.info("Compiling %s.", self.name)
+        graph = self._compile(leaves, structure, tensors)
+        result = graph(tensors)
+        self.graphs[form] = graph
+        log.info("Compiled %s in %.0f s.", self.name, time.perf_counter() - begin)
+        return result
+
+    def _compile(self, leaves: list, structure: Any, tensors: list[Tensor]) -> Callable:
+        """The compiled function of ``tensors``; torch compiles it when it is first called."""
         returned: list[Any] = []
 
         def flat(tensors: list[Tensor]) -> list[Tensor]:
             given = iter(tensors)
             args = [next(given) if isinstance(leaf, Tensor) else leaf for leaf in leaves]
-            with torch.enable_grad():
+            with torch.enable_grad(), _NoValues(self.name):
                 returned[:] = tree_flatten(self.function(*tree_unflatten(args, structure)))
             return [leaf.detach() for leaf in returned[0] if isinstance(leaf, Tensor)]
 
@@ -106,7 +128,4 @@ class Compiled:
             leaves = [constants[i] if i in constants else next(given) for i in range(count)]
             return tree_unflatten(leaves, form)
 
-        with torch.random.fork_rng():
-            run(tensors)
-        log.info("Compiled %s in %.0f s.", self.name, time.perf_counter() - begin)
         return run

@@ -84,10 +84,24 @@ def test_random_numbers_are_those_of_the_function():
         torch.testing.assert_close(ours, (noise(torch.zeros(4)), torch.rand(1)))
 
 
-def test_a_branch_on_a_value_is_refused():
-    compiled = Compiled(lambda x: x if x.sum() > 0 else -x, "a branch")
-    with pytest.raises(RuntimeError, match="value"):
-        compiled(torch.ones(2))
+def test_to_read_a_value_is_refused():
+    """It would stay what it was at the first call, of an argument or of a buffer."""
+    buffer = torch.ones(())
+    readers = (
+        lambda x: x if x.sum() > 0 else -x,
+        lambda x: x * float(buffer),
+        lambda x: x + buffer.item(),
+    )
+    for reader in readers:
+        with pytest.raises(RuntimeError, match="reader reads the value of a tensor"):
+            Compiled(reader, "reader")(torch.ones(2))
+
+
+def test_numbers_of_another_type_are_another_form():
+    compiled, x = Compiled(lambda x, k: x * k, "a product"), torch.ones(2, dtype=torch.int64)
+    for number in (1, 1.0, True):
+        assert compiled(x, number).dtype == (x * number).dtype
+    assert len(compiled.graphs) == 3
 
 
 def test_a_copy_reads_its_own_tensors():
