@@ -121,6 +121,21 @@ def value_operator(
 
 
 @dataclass(frozen=True)
+class _Whole:
+    """A critic that is not split, as a function of its parameters with the states, and of the action; equal
+    to another of the same critic, so that compiled code knows it again."""
+
+    critic: TensorDictModuleBase
+    action_key: NestedKey
+
+    def __call__(self, scene: tuple[TensorDictBase, TensorDictBase], action: Tensor) -> Tensor:
+        params, states = scene
+        with params.to_module(self.critic, preserve_module_state=False):
+            seen = self.critic(states.copy().set(self.action_key, action))
+        return seen.get(self.critic.out_keys[0])
+
+
+@dataclass(frozen=True)
 class BoundCritics:
     """Critics with stacked parameters in given states: values as functions of the action alone.
 
@@ -185,11 +200,6 @@ class BoundCritics:
             with params.to_module(critic, preserve_module_state=False):
                 return network.encode(*map(states.get, critic.in_keys[:-1]))  # pyright: ignore
 
-        def whole(scene: Any, action: Tensor) -> Tensor:
-            params, states = scene
-            with params.to_module(critic, preserve_module_state=False):
-                return critic(states.copy().set(action_key, action)).get(critic.out_keys[0])
-
         if vmap is None:
             vmap = tensordict.device is not None and tensordict.device.type != "cpu"
         if vmap:
@@ -197,7 +207,8 @@ class BoundCritics:
             scenes = torch.vmap(encode)(params, states) if split else [params, states]
         else:
             scenes = [encode(member, states) for member in params.unbind(0)]
-        return cls(network.value if split else whole, scenes, vmap, reduce)  # pyright: ignore
+        value = network.value if split else _Whole(critic, action_key)  # pyright: ignore
+        return cls(value, scenes, vmap, reduce)
 
     def values(self, action: Tensor) -> Tensor:
         """The value of each member, [n, *B, 1], for actions [*B, A]."""

@@ -13,7 +13,18 @@ from torchrl.envs import Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from saferl.envs.transforms import SafetyProjector
-from saferl.modules import CriticEnsemble, MLPValue, MMAMValue, projection, value_operator
+from saferl.modules import (
+    CriticEnsemble,
+    MLPValue,
+    MMAMValue,
+    PlainMMAMValue,
+    project,
+    projection,
+    value_operator,
+)
+
+
+SHARED = (projection._compiled_evaluate, projection._compiled_descend)
 
 
 def test_reads_the_live_critic():
@@ -74,7 +85,7 @@ def test_reads_the_live_critic():
 def test_compiled_in_parts(monkeypatch, backend, batch):
     """More states than one part holds, some of them safe, corrected as without compiling."""
     monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
-    for shared in (projection._compiled_evaluate, projection._compiled_descend):
+    for shared in SHARED:
         monkeypatch.setattr(shared, "graphs", {})
     torch.manual_seed(0)
     ensemble = CriticEnsemble([value_operator(MMAMValue(16), out_key="risk") for _ in range(2)])
@@ -91,3 +102,15 @@ def test_compiled_in_parts(monkeypatch, backend, batch):
     for key, value in plain.items():
         torch.testing.assert_close(compiled[key], value, rtol=0, atol=1e-5)
     assert [len(env.transform.latencies) for env in envs] == [1, 1]
+
+
+def test_a_critic_that_is_evaluated_whole_is_compiled_once(monkeypatch):
+    """Whoever binds it to states anew at each decision gets the same code."""
+    monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend="eager"))
+    for shared in SHARED:
+        monkeypatch.setattr(shared, "graphs", {})
+    ensemble = CriticEnsemble([value_operator(PlainMMAMValue(16), out_key="r") for _ in range(2)])
+    for _ in range(3):
+        states = TensorDict(ego=torch.randn(4, 9), vehicles=torch.ones(4, 3, 6), batch_size=4)
+        project(ensemble.bind(states), torch.zeros(4, 2), -1.0, steps=5, compile=True)
+    assert [len(shared.graphs) for shared in SHARED] == [1, 1]
