@@ -87,6 +87,8 @@ class Learner:
         gradients = torch.autograd.grad(
             torch.stack(terms).sum(), self._parameters(names), allow_unused=True
         )
+        # A fused Adam reads a transposed gradient in the wrong order without a word (torch 2.13).
+        gradients = [None if slope is None else slope.contiguous() for slope in gradients]
         return losses.detach(), batch.exclude(*given).detach(), gradients
 
     def update(self, batch: TensorDictBase) -> TensorDict:

@@ -28,9 +28,9 @@ def double():
     torch.set_default_dtype(before)
 
 
-def learner(*overrides: str, compile: bool = False) -> Learner:
-    """ARSAC with width 16 in float64, always with the same first weights."""
-    cfg = compose("algo=arsac", "encoder.policy.width=16", "device=cpu", *overrides)
+def learner(*overrides: str, algo: str = "arsac", compile: bool = False) -> Learner:
+    """With width 16 in float64, always with the same first weights."""
+    cfg = compose(f"algo={algo}", "encoder.policy.width=16", "device=cpu", *overrides)
     torch.manual_seed(0)
     loss = build_agent(cfg).loss.double()
     with torch.no_grad():  # cost critics begin at zero, which would hide what they do
@@ -104,3 +104,22 @@ def test_a_hundred_updates_equal_the_plain_ones(double):
         if isinstance(value, torch.Tensor) and value.is_floating_point():
             scale = value.abs().max().clamp(min=1e-3)
             assert (value - plain[key]).abs().max() <= 1e-6 * scale, key
+
+
+@pytest.mark.parametrize("compile", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("algo", ["arsac", "asac", "rsac", "sac"])
+def test_a_step_is_that_of_backward_and_plain_adam(double, algo, compile):
+    """The optimizer reads each gradient as it is meant, however it lies in memory."""
+    one, other = learner(algo=algo, compile=compile), learner(algo=algo)
+    plain = torch.optim.Adam(
+        [{"params": g["params"], "lr": g["lr"]} for g in other.optimizer.param_groups]
+    )
+    torch.manual_seed(1)
+    one.update(batch(0))
+    torch.manual_seed(1)
+    losses = other.loss(batch(0))
+    sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+    plain.step()
+    ours, theirs = (dict(each.loss.named_parameters()) for each in (one, other))
+    for name, parameter in ours.items():
+        torch.testing.assert_close(parameter, theirs[name], rtol=1e-7, atol=1e-7, msg=name)
