@@ -11,25 +11,31 @@ import torch
 from torch import Tensor
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_flatten, tree_unflatten
+from torch.utils._pytree import tree_flatten, tree_leaves, tree_unflatten
 
 log = logging.getLogger(__name__)
 
 
-class _NoValues(TorchDispatchMode):
-    """Refuses to read the value of a tensor: it would be a constant of the graph."""
+class _NoState(TorchDispatchMode):
+    """Refuses to read the value of a tensor that was there before: it would be a constant of the graph.
+
+    Of what is made meanwhile, torch itself refuses what depends on the arguments; the rest is constant.
+    """
 
     def __init__(self, name: str):
         super().__init__()
         self.name = name
+        self.made: dict[int, Any] = {}  # by identity, and kept, so that no other gets it
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        if func is torch.ops.aten._local_scalar_dense.default:
+        if func is torch.ops.aten._local_scalar_dense.default and id(args[0]) not in self.made:
             raise RuntimeError(
-                f"{self.name} reads the value of a tensor (a branch on it, float(), item()), which compiled code "
-                "would never read again: keep it a tensor, or do not compile."
+                f"{self.name} reads the value of a tensor (float(), item(), a branch), which compiled code would "
+                "never read again: keep it a tensor, or do not compile."
             )
-        return func(*args, **(kwargs or {}))
+        out = func(*args, **(kwargs or {}))
+        self.made |= {id(leaf): leaf for leaf in tree_leaves(out)}
+        return out
 
 
 class Compiled:
@@ -103,7 +109,7 @@ class Compiled:
         def flat(tensors: list[Tensor]) -> list[Tensor]:
             given = iter(tensors)
             args = [next(given) if isinstance(leaf, Tensor) else leaf for leaf in leaves]
-            with torch.enable_grad(), _NoValues(self.name):
+            with torch.enable_grad(), _NoState(self.name):
                 returned[:] = tree_flatten(self.function(*tree_unflatten(args, structure)))
             return [leaf.detach() for leaf in returned[0] if isinstance(leaf, Tensor)]
 
