@@ -24,6 +24,9 @@ REDUCTIONS: dict[str, Callable[[Tensor], Tensor]] = {
 
 Reduction = str | Callable[[Tensor], Tensor]
 
+#: Numbers in a member up to which stacked members are faster on a CPU, too: MMAM of width 32.
+_SMALL = 2**15
+
 
 def reduction(reduce: Reduction) -> Callable[[Tensor], Tensor]:
     """The function that a reduction is, or names.
@@ -187,8 +190,8 @@ class BoundCritics:
             tensordict: holds what the critics read.
             action_key: the entry that is the action.
             reduce: see the class.
-            vmap: whether to stack the members; by default on a GPU, which they fill together. A core
-                of a CPU is full with one.
+            vmap: whether to stack the members; by default on a GPU, which they fill together, and where each
+                is small. A core of a CPU is full with one large member.
         """
         states = tensordict.select(*(key for key in critic.in_keys if key != action_key))
         network = getattr(critic, "module", None)
@@ -201,7 +204,10 @@ class BoundCritics:
                 return network.encode(*map(states.get, critic.in_keys[:-1]))  # pyright: ignore
 
         if vmap is None:
-            vmap = tensordict.device is not None and tensordict.device.type != "cpu"
+            size = sum(value[0].numel() for value in params.values(True, True))
+            vmap = size <= _SMALL or (
+                tensordict.device is not None and tensordict.device.type != "cpu"
+            )
         if vmap:
             states = states.expand(params.batch_size[0], *states.batch_size)
             scenes = torch.vmap(encode)(params, states) if split else [params, states]
