@@ -56,7 +56,8 @@ def largest(rows: Tensor, present: Tensor) -> Tensor:
     a GELU makes 0 of it."""
     if not rows.shape[-2]:
         return rows.new_full((*rows.shape[:-2], rows.shape[-1]), _MASKED)
-    return torch.where(present, rows, _MASKED).amax(-2)
+    # A sum, whose gradient is the rows' own: choosing row by row takes a fifth of an update at width 64.
+    return (rows + torch.where(present, 0.0, _MASKED)).amax(-2)
 
 
 def flat_linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
