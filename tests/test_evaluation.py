@@ -111,7 +111,7 @@ def test_figures_against_gymnasium_by_hand():
 
 def test_conditions_of_a_test():
     """10 Hz, starts before the box, parked cars left alone, reward without r_safe."""
-    training = Scenario(route_starts=0.5, standstill=4.0, reward=Reward(risk_shaping=True))
+    training = Scenario(route_starts=0.5, standstill=8.0, reward=Reward(risk_shaping=True))
     scenario = as_test(training)
     assert scenario == Scenario(policy_frequency=10)
     rows = evaluate(

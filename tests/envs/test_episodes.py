@@ -96,7 +96,7 @@ def test_a_decision_lasts_as_long_as_the_clock_says(frequency):
 
 
 @pytest.mark.parametrize("frequency", [5, 10])
-def test_a_car_that_stands_still_is_truncated_in_its_time(frequency):
+def test_a_car_that_stands_still_is_terminated_in_its_time(frequency):
     env = make(1, task="gs", standstill=2.0, policy_frequency=frequency)
     speed = reset(env)["ego"][0, 3].item()
     still = 0
@@ -108,9 +108,9 @@ def test_a_car_that_stands_still_is_truncated_in_its_time(frequency):
         speed = max(speed + action[0] * 5.0 / frequency, 0.0)
         assert view["ego"][0, 3].item() == pytest.approx(speed, abs=1e-4)
         still = still + 1 if speed < 0.3 else 0
-        assert view["truncated"].item() == (still >= 2 * frequency)
-        assert not view["terminated"].item()
-        if view["truncated"].item():
+        assert view["terminated"].item() == (still >= 2 * frequency)
+        assert not view["truncated"].item()
+        if view["terminated"].item():
             break
     assert still == 2 * frequency
 

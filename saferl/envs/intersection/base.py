@@ -66,9 +66,9 @@ class Scenario:
         duration: seconds until ``truncated``.
         route_starts: fraction of the starts drawn uniformly along the route instead of 40 m before
             the box (training only).
-        standstill: seconds after which a car that stands still is ``truncated`` (training only, ours):
-            learners bootstrap through it, so that the task is the same and fewer of the stored frames
-            show a parked car. None: never.
+        standstill: seconds after which a car that stands still is ``terminated`` (training only, ours):
+            nothing more can be earned, so that the value of standing does not rest on itself. None:
+            never.
         reward, cost: see :class:`Reward` and :class:`CollisionCost`.
 
     >>> Scenario(task="uturn")

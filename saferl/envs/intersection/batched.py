@@ -211,8 +211,8 @@ def advance(scenario: Scenario, state: State, action: Tensor) -> tuple[State, St
         ego, route, control, previous, own[:, -2], own[:, -1], seen["within_view"].any(-1),
         off | collision, success,
     )  # fmt: skip
-    terminated = off | collision | success
-    truncated = (after["steps"] >= scenario.horizon) | (after["still"] >= scenario.patience)
+    terminated = off | collision | success | (after["still"] >= scenario.patience)
+    truncated = after["steps"] >= scenario.horizon
     return scenes_last(after), {
         "collision": collision, "offroad": off, "success": success, "reward": reward, "cost": cost,
         "terminated": terminated, "truncated": truncated, "done": terminated | truncated,

@@ -226,9 +226,9 @@ class IntersectionEnv(gymnasium.Env):
             ego.state, self._route, control, previous, self._own[-2], self._own[-1],
             self._observed.any(), torch.tensor(collision or off), torch.tensor(success),
         )  # fmt: skip
-        terminated = collision or off or success
         self._still = self._still + 1 if ego.state[2] < STANDING else 0
-        truncated = self._steps >= scenario.horizon or self._still >= scenario.patience
+        terminated = collision or off or success or self._still >= scenario.patience
+        truncated = self._steps >= scenario.horizon
         info = self._info(cost, collision, off, success)
         return observation, float(reward), terminated, truncated, info
 
