@@ -2,12 +2,12 @@
 
     python benchmarks/time_to_safe.py OUT [--runs "algo=arsac" "algo=sac task.observation=world" ...]
         [--seeds 0 1 2] [--minutes 30] [--every 3] [--episodes 500] [--set KEY=VALUE ...] [--jobs 2]
-        [--peers intersection-v1 ours] [--json PATH]
+        [--peers intersection-v1 ours] [--peer-minutes 10] [--json PATH]
 
 Trains each composition with each seed on ``task=mixed``, ``--jobs`` at once with one thread each, and tests it every
 few minutes on left, straight and right, 500 episodes each at 10 Hz, with its projector. Minutes are of collecting,
-compiling and learning; tests do not count. A run ends with its budget of frames, with the minutes, or when it has
-passed the last mark. What is in OUT already is not run again.
+compiling and learning; tests do not count. A run ends with its budget of frames, or with the first test after the minutes.
+What is in OUT already is not run again.
 
 ``--peers`` are what a user would take instead, each trained for the minutes and then tested once, in ``--episodes``
 in all: ``intersection-v1`` is Stable-Baselines3's SAC on highway-env's own intersection with continuous actions,
@@ -42,6 +42,7 @@ from side_by_side import belongs, write
 from saferl.agents import make
 from saferl.builders import build_env, build_trainer
 from saferl.commands import claim, compiling
+from saferl.envs.transforms import SafetyProjector
 from saferl.evaluation import as_test, evaluate
 from saferl.paths import config_dir
 
@@ -54,33 +55,40 @@ class Over(Exception):
     """The minutes are spent."""
 
 
-def test(cfg: Any, trainer: Any, episodes: int) -> dict[str, float]:
+def test_projector(cfg: Any, loss: Any) -> list[SafetyProjector]:
+    """What corrects in the tests of a training, compiled where the losses are; none where it has none."""
+    cfg = compiling(cfg, cfg.compile)
+    if cfg.projector._target_ is None:
+        return []
+    projector = make(cfg.projector, risk=loss.cost_value)
+    projector.set_progress(1.0)
+    return [projector]
+
+
+def test(cfg: Any, trainer: Any, projector: list, episodes: int) -> dict[str, float]:
     """Rates on the three tasks and their means, by ``END`` and ``END_TASK``."""
     scenario = hydra.utils.instantiate(cfg.task)
     cfg = compiling(cfg, False)
-    if "compile" in cfg.projector:
-        cfg.projector.compile = True
     figures: dict[str, float] = {}
     for task in TASKS:
-        transforms = []
-        if cfg.projector._target_ is not None:
-            transforms = [make(cfg.projector, risk=trainer.learner.loss.cost_value)]
-            transforms[0].set_progress(1.0)
         one = as_test(dataclasses.replace(scenario, task=task))
-        env = build_env(cfg, one, min(episodes, 250), 0, *transforms)
+        env = build_env(cfg, one, min(episodes, 250), 0, *projector)
         rows = evaluate(trainer.collector.policy, env, episodes, seed=0, progress=False)
+        for transform in projector:
+            transform.reset_parent()  # for the next environment
         figures |= {f"{end}_{task}": sum(row[end] for row in rows) / len(rows) for end in ENDS}
     means = {end: sum(figures[f"{end}_{task}"] for task in TASKS) / len(TASKS) for end in ENDS}
     return means | figures
 
 
-def train(overrides: list[str], out: Path, minutes: float, every: float, episodes: int) -> None:
+def train(out: Path, overrides: list[str], minutes: float, every: float, episodes: int) -> None:
     """One training in this process; ``tests.csv`` in ``out`` gets a row for each test."""
     with initialize_config_dir(config_dir(), version_base="1.3"):
         cfg = compose("config", [*overrides, "threads=1", "logger=none", "save_minutes=null"])
     shutil.rmtree(out, ignore_errors=True)  # of a run that was stopped
     begin, testing, due = time.monotonic(), 0.0, every
     trainer = build_trainer(cfg, out)
+    projector = test_projector(cfg, trainer.learner.loss)
     claim(out, cfg)
     rows: list[dict] = []
 
@@ -98,7 +106,7 @@ def train(overrides: list[str], out: Path, minutes: float, every: float, episode
         due = spent + every
         progress = trainer.progress
         row = {"minutes": round(spent, 3), "frames": progress.frames, "updates": progress.updates}
-        rows.append(row | test(cfg, trainer, episodes))
+        rows.append(row | test(cfg, trainer, projector, episodes))
         with (out / "tests.part").open("w", newline="") as file:
             writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
             writer.writeheader()
@@ -116,7 +124,7 @@ def train(overrides: list[str], out: Path, minutes: float, every: float, episode
     (out / "tests.part").rename(out / "tests.csv")
 
 
-def peer(name: str, out: Path, minutes: float, episodes: int) -> None:
+def peer(out: Path, name: str, minutes: float, episodes: int) -> None:
     """Stable-Baselines3's SAC for so many minutes, then tested; ``tests.csv`` gets one row."""
     from stable_baselines3 import SAC
     from stable_baselines3.common.callbacks import BaseCallback
@@ -175,6 +183,38 @@ def peer(name: str, out: Path, minutes: float, episodes: int) -> None:
         writer.writerow(row)
 
 
+Work = dict[Path, tuple[Callable, dict[str, Any]]]
+"""By its folder, where ``tests.csv`` will be: a function of the folder, and what else it is told."""
+
+
+def carry_out(work: Work, jobs: int) -> None:
+    """Do what is not done yet, ``jobs`` at once.
+
+    Raises:
+        SystemExit: a folder holds what was done with other settings.
+    """
+    os.environ["OMP_NUM_THREADS"] = "1"
+    done = {folder for folder in work if (folder / "tests.csv").exists()}
+    for folder in done:
+        belongs(folder, work[folder][1])
+    # A process for each run: what one compiles or allocates is no other's.
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), max_tasks_per_child=1) as pool:
+        waiting = {
+            folder: pool.submit(function, folder, **settings)
+            for folder, (function, settings) in work.items()
+            if folder not in done
+        }
+        for folder, each in waiting.items():
+            each.result()
+            belongs(folder, work[folder][1])
+
+
+def tests(folder: Path) -> list[dict[str, float]]:
+    """The rows of ``tests.csv``."""
+    with (folder / "tests.csv").open(newline="") as file:
+        return [{k: float(v) for k, v in row.items()} for row in csv.DictReader(file)]
+
+
 def marks(rows: list[dict[str, float]]) -> dict[str, dict[str, float] | None]:
     """The first test at which each mark was passed."""
     return {
@@ -206,37 +246,27 @@ def main() -> None:
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="of all runs")
     parser.add_argument("--jobs", type=int, default=2, help="runs at once")
     parser.add_argument("--peers", nargs="*", default=[])
+    parser.add_argument("--peer-minutes", type=float, help="of each peer; by default --minutes")
     parser.add_argument("--json", type=Path, help="write the figures here")
     options = parser.parse_args()
     for name in set(options.peers) - {"intersection-v1", "ours"}:
         raise SystemExit(f"--peers must be among intersection-v1, ours, got {name!r}")
 
-    belongs(options.out, {"episodes": options.episodes, "set": options.set})
     folders: dict[tuple[str, str], Path] = {}
-    work: list[tuple[Callable, tuple]] = []
+    work: Work = {}
+    tested = {"minutes": options.minutes, "episodes": options.episodes}
     for seed in options.seeds:
         for name in options.runs:
             folder = options.out / re.sub(r"[^\w.]+", "_", name) / f"seed{seed}"
             folders[name, str(seed)] = folder
             overrides = ["task=mixed", *name.split(), *options.set, f"seed={seed}"]
-            arguments = (overrides, folder, options.minutes, options.every, options.episodes)
-            work.append((train, arguments))
+            work[folder] = train, {"overrides": overrides, "every": options.every, **tested}
     for name in options.peers:
         folder = options.out / f"peer_{name}"
         folders[f"SB3 SAC, {name}", "0"] = folder
-        work.append((peer, (name, folder, options.minutes, options.episodes)))
-    os.environ["OMP_NUM_THREADS"] = "1"
-    # A process for each run: what one compiles or allocates is no other's.
-    with ProcessPoolExecutor(
-        options.jobs, mp_context=get_context("spawn"), max_tasks_per_child=1
-    ) as pool:
-        waiting = [
-            pool.submit(function, *arguments)
-            for function, arguments in work
-            if not (next(a for a in arguments if isinstance(a, Path)) / "tests.csv").exists()
-        ]
-        for each in waiting:
-            each.result()
+        peer_minutes = options.peer_minutes or options.minutes
+        work[folder] = peer, {"name": name, **tested, "minutes": peer_minutes}
+    carry_out(work, options.jobs)
 
     figures: dict = {}
     print(
@@ -246,8 +276,7 @@ def main() -> None:
         f"|{'---|' * (len(MARKS) + 4)}"
     )
     for (name, seed), folder in folders.items():
-        with (folder / "tests.csv").open(newline="") as file:
-            rows = [{k: float(v) for k, v in row.items()} for row in csv.DictReader(file)]
+        rows = tests(folder)
         show(name, seed, rows)
         figures[f"{name}, {seed}"] = {"tests": rows, "marks": marks(rows)}
     for name in dict.fromkeys(name for name, _ in folders):
