@@ -25,7 +25,7 @@ slow: setup
 	$(BIN)/python -m pytest -m slow -q
 
 gpu: setup
-	$(BIN)/python benchmarks/gpu.py $(or $(OUT),gpu)
+	$(BIN)/python benchmarks/gpu.py $(or $(OUT),runs/gpu)
 
 lint: setup
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright

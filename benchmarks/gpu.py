@@ -17,7 +17,6 @@ such, with the end of what it said, and the others go on:
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import signal
@@ -28,6 +27,8 @@ from pathlib import Path
 from typing import Any
 
 from side_by_side import write
+
+from saferl.metrics import CsvLog
 
 HERE = Path(__file__).parent
 
@@ -100,11 +101,10 @@ def perform(seconds: float, command: list[str]) -> dict[str, Any]:
 
 def progress(run: Path) -> dict[str, float]:
     """The last rows of a run that was stopped, and what 10,000 episodes would take."""
-    tables = {}
-    for name in ("metrics", "timing"):
-        with (run / f"{name}.csv").open(newline="") as file:
-            tables[name] = [{k: float(v) for k, v in row.items()} for row in csv.DictReader(file)]
-    last, timing = tables["metrics"][-1], tables["timing"][-1]
+    metrics, timings = (CsvLog(run / f"{name}.csv").read() for name in ("metrics", "timing"))
+    if not metrics or not timings:
+        return {}
+    last, timing = metrics[-1], timings[-1]
     seconds = timing["collect"] + timing["learn"] + timing["other"]
     return {
         **last,
@@ -122,6 +122,10 @@ def main() -> None:
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cuda")
     parser.add_argument("--small", action="store_true")
     options = parser.parse_args()
+    if options.out.exists():
+        raise SystemExit(
+            f"{options.out} exists: name another folder, as in make gpu OUT=runs/gpu2."
+        )
     options.out.mkdir(parents=True)
     figures: dict[str, Any] = {"device": options.device, "small": options.small}
     for name, (seconds, command) in parts(options.out, options.device, options.small).items():

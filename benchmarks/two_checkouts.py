@@ -22,7 +22,7 @@ from typing import Any
 from side_by_side import conditions, medians, parser, rate, write
 
 
-def serve(overrides: list[str], batch: int, threads: int, compiled: bool) -> None:
+def serve(overrides: list[str], options: Any) -> None:
     """The child: gets ready, says so, and answers each line, a number of seconds, with a rate."""
     import torch
     from hydra import compose, initialize_config_dir
@@ -32,14 +32,15 @@ def serve(overrides: list[str], batch: int, threads: int, compiled: bool) -> Non
     from saferl.builders import build_learner
     from saferl.paths import config_dir
 
-    torch.set_num_threads(threads)
-    overrides = [*overrides, "device=cpu", f"compile={compiled}"]
+    torch.set_num_threads(options.threads)
+    device, compiled = options.device, options.modes == ["compiled"]
+    overrides = [*overrides, f"device={device}", f"compile={compiled}"]
     with initialize_config_dir(config_dir(), version_base=None):
         cfg = compose("config", overrides)
         if "observation" in cfg.task:  # older commits have no other than the world's
             cfg = compose("config", [*overrides, "task.observation=world"])
     torch.manual_seed(0)
-    learner, data = build_learner(cfg, build_agent(cfg).loss), transitions(batch, "cpu")
+    learner, data = build_learner(cfg, build_agent(cfg).loss), transitions(options.batch, device)
 
     def work() -> int:
         learner.update(data)
@@ -51,7 +52,7 @@ def serve(overrides: list[str], batch: int, threads: int, compiled: bool) -> Non
     graphs = torch._dynamo.utils.counters["stats"]["unique_graphs"]
     print(json.dumps({"first": time.perf_counter() - begin, "graphs": graphs}), flush=True)
     for line in sys.stdin:
-        print(rate(work, float(line), "wall"), flush=True)
+        print(rate(work, float(line), options.clock, device), flush=True)
 
 
 class Side:
@@ -59,13 +60,13 @@ class Side:
 
     def __init__(self, checkout: Path, run: str, mode: str, options: Any):
         command = [sys.executable, __file__, "--serve", run, "--modes", mode]
-        command += ["--batch", str(options.batch), "--threads", str(options.threads)]
+        for name in ("batch", "threads", "device", "clock"):
+            command += [f"--{name}", str(getattr(options, name))]
         self.child = subprocess.Popen(
             command,
             env={**os.environ, "PYTHONPATH": str(checkout)},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
             text=True,
         )
         self.ready = json.loads(self._line(" ".join(command)))
@@ -95,7 +96,7 @@ def main() -> None:
     arguments.add_argument("--serve", metavar="RUN", help="for the children alone")
     options = arguments.parse_args()
     if options.serve is not None:
-        serve(options.serve.split(), options.batch, options.threads, options.modes == ["compiled"])
+        serve(options.serve.split(), options)
         return
     if options.other is None or not (options.other / "saferl").is_dir():
         raise SystemExit(f"OTHER must be a checkout of saferl, got {options.other}.")
