@@ -136,7 +136,7 @@ def build_learner(cfg: DictConfig, loss: LossModule) -> Learner:
         loss,
         build_optimizer(cfg, loss),
         SoftUpdate(loss, tau=cfg.tau) if _has_targets(loss) else None,
-        order=cfg.get("update_order", "joint"),  # a run from before this setting has none
+        order=cfg.update_order,
         compile=cfg.compile,
     )
 
@@ -153,7 +153,7 @@ def build_experience(cfg: DictConfig, agent: Agent, scenario: Any) -> Replay | E
         raise ValueError(
             f"{loss_name} learns from experience={name}, got {cfg.experience._target_}."
         )
-    demonstrations = cfg.get("demonstrations")  # a run from before this setting has none
+    demonstrations = cfg.demonstrations
     if demonstrations and fresh:
         raise ValueError(
             f"demonstrations are for a replay buffer, which {loss_name} has not: "
@@ -252,8 +252,7 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
     num_envs = cfg.env.num_envs
     env = build_env(cfg, scenario, num_envs, cfg.seed, *transforms)
     policy: Any = agent.actor
-    # A run from before this setting has none.
-    if cfg.get("exploration", 0.0) and not on_policy(cfg):
+    if cfg.exploration and not on_policy(cfg):
         explore: Any = HeldActions(env.action_spec, cfg.exploration, cfg.exploration_hold)
         policy = TensorDictSequential(policy, explore)
     collector = Collector(

@@ -88,7 +88,7 @@ class MLPPolicyEncoder(nn.Module):
         vehicle_scale: divisors of a vehicle's features; I_veh comes first.
         size: of a plain ``observation`` [*B, size] that takes the place of ego and vehicles; None: these.
 
-    Reads ``ego`` [*B, 9] and ``vehicles`` [*B, M, 6], SI units; returns features [*B, width].
+    Reads ``ego`` [*B, F] and ``vehicles`` [*B, M, G], SI units, as many features as scales; returns features [*B, width].
 
     Raises:
         ValueError: if ``depth < 1``, a feature scale is not positive and finite, or (at the call)
@@ -147,7 +147,7 @@ class MLPValue(nn.Module):
         outputs: K, more than one for the quantiles of a distributional critic.
         layer_norm: normalise each hidden layer before its activation, without gain or bias.
 
-    Reads ``ego`` [*B, 9], ``vehicles`` [*B, M, 6] (SI units) and ``action`` [*B, 2] in [-1, 1];
+    Reads ``ego`` [*B, F], ``vehicles`` [*B, M, G] (SI units, as many features as scales) and ``action`` [*B, 2] in [-1, 1];
     returns values [*B, K].
 
     Raises:

@@ -190,7 +190,7 @@ class MMAMPolicyEncoder(nn.Module):
         ego_scale: divisors of the ego features; their number is the size of ``ego``.
         vehicle_scale: divisors of a vehicle's features; I_veh comes first.
 
-    Reads ``ego`` [*B, 9] and ``vehicles`` [*B, M, 6], SI units; returns features [*B, width].
+    Reads ``ego`` [*B, F] and ``vehicles`` [*B, M, G], SI units, as many features as scales; returns features [*B, width].
 
     Raises:
         ValueError: if ``heads`` does not divide ``width``, ``scale`` or ``keys`` is unknown, or a
@@ -263,9 +263,10 @@ class MMAMValue(nn.Module):
         vehicle_scale: divisors of a vehicle's features; I_veh comes first.
         outputs: K, more than one for the quantiles of a distributional critic; what the attention reads
             shifts them all alike (ours).
-        layer_norm: normalise each layer of the MLP branch before its activation, without gain or bias.
+        layer_norm: normalise each layer of the MLP branch but the first, on the SVs, before its activation, without gain
+            or bias.
 
-    Reads ``ego`` [*B, 9], ``vehicles`` [*B, M, 6] (SI units) and ``action`` [*B, 2] in [-1, 1];
+    Reads ``ego`` [*B, F], ``vehicles`` [*B, M, G] (SI units, as many features as scales) and ``action`` [*B, 2] in [-1, 1];
     returns values [*B, K].
 
     Raises:

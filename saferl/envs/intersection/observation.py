@@ -219,7 +219,12 @@ def observe(
         first, absent rows zero; and which of the N vehicles are observed, bool [..., N]. The last two
         features of the ego are ``d_veh`` and ``d_des`` in both forms. Of ``world``, a vehicle's heading
         lies in [-3 pi / 4, 5 pi / 4).
+
+    Raises:
+        ValueError: there is no such form.
     """
+    if form not in FORMS:
+        raise ValueError(f"form must be one of {', '.join(FORMS)}, got {form!r}.")
     # Vehicles come first here, [N, ...].
     x, y, v_x, v_y, heading, yaw_rate = vehicles.movedim(-2, 0).unbind(-1)
     own_x, own_y, own_v_x, own_v_y, phi, omega = ego.unbind(-1)
