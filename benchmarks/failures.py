@@ -5,10 +5,12 @@
 Plays the run's task from the usual starts at the frequency of its training, with the mean action and no projector, so that critics are
 asked about what they learned. Prints
 
-- the episodes that were not over in time: how many stand in the box, how many before it, how many are on their way, and of the
+- the episodes that were not over in time: how many stand in the box, how many elsewhere, how many are on their way, and of the
   first few where they were and how fast, every two seconds;
-- what the reward critics say that standing is worth, beside what it is worth for ever;
-- by the cost critics' value, the discounted cost that followed; and their value in the last decisions before a crash.
+- what the reward critics say that standing there is worth, beside what it is worth: for ever, or as long as training lets
+  a car stand (off-policy losses);
+- by the risk that cost critics tell, the discounted cost that followed; and that risk in the last decisions before a crash
+  (losses with cost critics of actions).
 """
 
 from __future__ import annotations
@@ -19,13 +21,15 @@ from pathlib import Path
 
 import hydra
 import torch
+from cost_critics import followed
 from side_by_side import write
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from saferl.agents import load_agent
 from saferl.builders import build_env
 from saferl.checkpoint import run_config
-from saferl.envs.intersection.observation import reading
+from saferl.envs.intersection.geometry import ARM, project, reference_lines
+from saferl.envs.intersection.observation import as_world
 from saferl.modules import CriticEnsemble
 
 EDGES = (-1.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 2.0)
@@ -44,6 +48,11 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     cfg = run_config(options.run, "RUN")
+    if "route_starts" not in cfg.task:
+        raise SystemExit(f"RUN must be a training on the road, got one on {cfg.task.task}.")
+    patience = hydra.utils.instantiate(
+        cfg.task
+    ).patience  # decisions that training lets a car stand
     cfg.device, cfg.task.route_starts, cfg.task.standstill = "cpu", 0.0, None
     agent = load_agent(cfg, options.run, "RUN")
     scenario = hydra.utils.instantiate(cfg.task)
@@ -57,7 +66,9 @@ def main() -> None:
     first = torch.where(done.any(1), done.int().argmax(1), horizon)
     late = ((first == horizon) & ~after["success"][:, horizon, 0] & ~crash[:, horizon]).nonzero()
     late = late.squeeze(-1)
-    s, speed = reading(data["ego"], "s"), reading(data["ego"], "v_x")
+    ego, _ = as_world(data["ego"], data["vehicles"])
+    _, s, _ = project(ego[..., 1:3], reference_lines(data["route"].squeeze(-1), ego)[..., 0, :, :])
+    s, speed = s - ARM, ego[..., 3]
     stands = late[speed[late, horizon] < 0.5]
     inside = ((s[stands, horizon] > 0) & (s[stands, horizon] < BOX + 2)).sum().item()
     figures: dict = {
@@ -77,35 +88,33 @@ def main() -> None:
         print(f"  episode {index}, route {int(data['route'][index, 0])}: {where}")
 
     loss = agent.loss
-    if len(stands):
+    if len(stands) and hasattr(loss, "qvalue_network"):
         states = data[stands, horizon]
         critics = CriticEnsemble(
             loss.qvalue_network, params=loss.qvalue_network_params, reduce="min"
         )
         with torch.no_grad():
             values = critics.values(states).amin(0).flatten()
-        for_ever = after["reward"][stands, horizon, 0].mean() * cfg.reward_scale / (1 - cfg.gamma)
-        figures["value of standing"] = values.tolist()
-        figures["standing for ever"] = for_ever.item()
+        earned = after["reward"][stands, horizon, 0].mean().item() * cfg.reward_scale
+        # A critic does not see for how long a car has stood: each decision may be the last of so many.
+        worth = earned / (1 - cfg.gamma * (1 - 1 / patience))
+        figures["value of standing"], figures["worth of standing"] = values.tolist(), worth
         print(
             f"standing is worth {values.min():.2f} to {values.max():.2f} (median {values.median():.2f}) by the reward critics, "
-            f"for ever {for_ever:.2f}"
+            f"{worth:.2f} in training, {earned / (1 - cfg.gamma):.2f} for ever"
         )
-    if not hasattr(loss, "cost_value"):
+    if "action" not in getattr(getattr(loss, "cost_value", None), "in_keys", ()):
         write(options.json, figures)
         return
 
     with torch.no_grad():
-        risk = loss.cost_value.values(data.reshape(-1)).amax(0).reshape(done.shape)
-    cost = after["cost"].squeeze(-1)
-    follows, known = torch.zeros_like(cost), torch.zeros_like(done)
-    total, seen = torch.zeros(len(cost)), torch.zeros(len(cost), dtype=torch.bool)
-    for t in reversed(range(cost.shape[1])):
-        total, seen = torch.where(done[:, t], 0.0, total), seen | done[:, t]
-        follows[:, t] = total = cost[:, t] + cfg.gamma * total
-        known[:, t] = seen
+        risk = (
+            loss.cost_value(data.reshape(-1)).get(loss.cost_value.out_keys[0]).reshape(done.shape)
+        )
+    follows, known = followed(data, cfg.gamma)
     print(
-        f"Q_c {risk[known].mean():.3f}, what follows {follows[known].mean():.3f}, {int(known.sum())} states"
+        f"Q_c {risk[known].mean():.3f}, what follows {follows[known].mean():.3f}, {int(known.sum())} states of "
+        "episodes that ended before their time"
     )
     rows = []
     for low, high in itertools.pairwise(EDGES):

@@ -46,11 +46,13 @@ def run(tmp_path_factory) -> Path:
         ["training", "--algos", "sac_lag", "--episodes", "20", "--set", *FAST],
         ["traffic", "--episodes", "5"],
         ["oracle", "--episodes", "2"],
+        ["two_checkouts", ".", "--runs", "algo=sac encoder.policy.width=16", "--modes", "eager", "--batch", "8",
+         *SHORT],
         ["reward_audit", "--episodes", "4"],
         ["mmam_forms", "--seeds", "0", "--updates", "20", "--width", "16"],
     ],
     ids=lambda arguments: arguments[0],
-)
+)  # fmt: skip
 def test_of_nothing(arguments: list[str]):
     assert command(f"benchmarks/{arguments[0]}.py", *arguments[1:])
 
@@ -59,6 +61,7 @@ def test_of_nothing(arguments: list[str]):
     "arguments",
     [
         ["calibration", "{run}", "--episodes", "5"],
+        ["failures", "{run}", "--episodes", "8"],
         ["cost_critics", "{run}", "--updates", "20", "--width", "16"],
         ["projection", "{run}", "--samples", "64"],
         ["backends", "{run}", "--episodes", "4", "--tasks", "gs", "--drivers", "blind"],
@@ -77,3 +80,16 @@ def test_of_a_run(arguments: list[str], run: Path, tmp_path: Path):
     name, *rest = (argument.format(run=run, out=tmp_path) for argument in arguments)
     command(f"benchmarks/{name}.py", *rest)
     assert name != "curves" or (tmp_path / "curves.png").stat().st_size > 1000
+
+
+def test_progress_of_a_run_that_has_not_learned_yet(tmp_path: Path, monkeypatch):
+    """Its first rows hold no losses."""
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    from gpu import progress
+
+    assert progress(tmp_path) == {}
+    (tmp_path / "metrics.csv").write_text("episodes,loss_actor\n10,\n20,0.5\n30,\n")
+    (tmp_path / "timing.csv").write_text("collect,learn,other,updates\n1,2,1,8\n")
+    figures = progress(tmp_path)
+    assert figures["updates_per_second"] == 2.0
+    assert figures["minutes_for_10000_episodes"] == 1e4 / 30 * 4 / 60

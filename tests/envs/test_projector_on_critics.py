@@ -23,7 +23,6 @@ from saferl.modules import (
     value_operator,
 )
 
-
 SHARED = (projection._compiled_evaluate, projection._compiled_descend)
 
 
