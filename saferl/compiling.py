@@ -49,12 +49,13 @@ class Compiled:
 
     Tensors that are no arguments, such as parameters, are read where they are: change them in place. All else is as
     it was at the first call: a number or an attribute that the function looks up, and what it decided by them; to read
-    a tensor's value is refused. No gradient flows out of what is returned; on a GPU it is valid until the next call.
+    a tensor's value is refused. No gradient flows out of what is returned; on a GPU it is valid until the next call (but for ``cpp``).
 
     Args:
         function: of nested containers of tensors and constants, TensorDicts among them.
         name: of what is compiled, for the log.
-        cpp: call the kernels from C++ in place of Python, on a CPU: for many small ones.
+        cpp: call the kernels from C++ in place of Python, on a CPU: for many small ones. On a GPU they are then not
+            replayed as a CUDA graph, so that what is returned stays valid and may be given back.
 
     Attributes:
         graphs: the compiled graphs, by the form of their arguments.
@@ -124,7 +125,7 @@ class Compiled:
         options: dict[str, Any] = {
             "fallback_random": True,
             # A GPU would wait for Python between many small kernels.
-            "triton.cudagraphs": cuda,
+            "triton.cudagraphs": cuda and not self.cpp,
             "cpp_wrapper": self.cpp and not cuda,
         }
         fast = torch.compile(graph, fullgraph=True, dynamic=False, options=options)
