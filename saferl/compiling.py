@@ -49,7 +49,8 @@ class Compiled:
 
     Tensors that are no arguments, such as parameters, are read where they are: change them in place. All else is as
     it was at the first call: a number or an attribute that the function looks up, and what it decided by them; to read
-    a tensor's value is refused. No gradient flows out of what is returned; on a GPU it is valid until the next call (but for ``cpp``).
+    a tensor's value is refused. No gradient flows out of what is returned; on a GPU it is valid until the next call
+    (but for ``cpp``).
 
     Args:
         function: of nested containers of tensors and constants, TensorDicts among them.

@@ -204,10 +204,9 @@ class BoundCritics:
                 return network.encode(*map(states.get, critic.in_keys[:-1]))  # pyright: ignore
 
         if vmap is None:
-            size = sum(value[0].numel() for value in params.values(True, True))
-            vmap = size <= _SMALL or (
-                tensordict.device is not None and tensordict.device.type != "cpu"
-            )
+            size = sum(value.numel() for value in params.values(True, True))
+            on_cpu = tensordict.device is None or tensordict.device.type == "cpu"
+            vmap = not on_cpu or size <= _SMALL * params.batch_size[0]
         if vmap:
             states = states.expand(params.batch_size[0], *states.batch_size)
             scenes = torch.vmap(encode)(params, states) if split else [params, states]
