@@ -130,6 +130,7 @@ class _Whole:
 
     critic: TensorDictModuleBase
     action_key: NestedKey
+    __name__ = "a critic"  # what vmap calls it: to make a repr cannot be compiled
 
     def __call__(self, scene: tuple[TensorDictBase, TensorDictBase], action: Tensor) -> Tensor:
         params, states = scene
