@@ -50,9 +50,8 @@ def main() -> None:
     cfg = run_config(options.run, "RUN")
     if "route_starts" not in cfg.task:
         raise SystemExit(f"RUN must be a training on the road, got one on {cfg.task.task}.")
-    patience = hydra.utils.instantiate(
-        cfg.task
-    ).patience  # decisions that training lets a car stand
+    # Decisions for which training lets a car stand.
+    patience = hydra.utils.instantiate(cfg.task).patience
     cfg.device, cfg.task.route_starts, cfg.task.standstill = "cpu", 0.0, None
     agent = load_agent(cfg, options.run, "RUN")
     scenario = hydra.utils.instantiate(cfg.task)
