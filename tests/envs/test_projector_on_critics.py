@@ -103,6 +103,13 @@ def test_compiled_in_parts(monkeypatch, backend, batch):
     assert [len(env.transform.latencies) for env in envs] == [1, 1]
 
 
+def test_compiling_needs_a_risk_that_binds():
+    risk = value_operator(MLPValue(2, 8), out_key="risk")
+    with pytest.raises(ValueError, match=r"needs a risk with bind\(\).*set compile=False for"):
+        SafetyProjector(risk, 0.1, compile=True)
+    assert not SafetyProjector(risk, 0.1).settings["compile"]
+
+
 def test_a_critic_that_is_evaluated_whole_is_compiled_once(monkeypatch):
     """Whoever binds it to states anew at each decision gets the same code."""
     monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend="eager"))

@@ -119,7 +119,7 @@ class SafetyProjector(Transform):
         project(lambda action: action.sum(-1), torch.zeros(0, 1), self.limit, **self.settings)
         if compile and not hasattr(risk, "bind"):
             raise ValueError(
-                f"compile=True needs a risk with bind(), as CriticEnsemble, got {risk}."
+                f"compile=True needs a risk with bind(), as CriticEnsemble; set compile=False for {risk}."
             )
         self.settings["compile"] = compile
         self._see = self._look
