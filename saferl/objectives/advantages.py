@@ -3,54 +3,83 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives import PPOLoss
 from torchrl.objectives.utils import distance_loss
 
+from saferl.objectives.adapter import LossMixin
 from saferl.objectives.checks import check_begun, check_cost, check_gamma
 
 
-class CostValueLoss(LossModule):
-    r"""Base of the on-policy losses with a cost: V_c(s), a second GAE, and the cost of a policy.
+@dataclass
+class CostValueKeys(PPOLoss._AcceptedKeys):
+    """Keys that ``set_keys`` accepts beside those of :class:`~torchrl.objectives.PPOLoss`.
 
-    Comes before a loss of TorchRL among the bases of a class, as in
-    ``class PPOLagLoss(CostValueLoss, ClipPPOLoss)``. The subclass calls :meth:`_add_cost_value` once its
-    other networks are there.
-
-    :meth:`begin` is for a whole batch of fresh transitions ``[*B, T]``: it writes the advantages and value
-    targets of reward and cost, which the mini-batches then carry. A limit on an episode's cost is about the
-    episode, so that the cost's estimator stops where one is ``done``; the reward's goes on through a
-    truncation, as everywhere. Both go on where a batch cuts an episode off.
+    Attributes:
+        cost: the cost under ``"next"``.
+        state_cost_value: what the cost critic writes.
+        cost_advantage, cost_value_target: written by ``begin``, read by the loss.
     """
+
+    cost: NestedKey = "cost"
+    state_cost_value: NestedKey = "state_cost_value"
+    cost_advantage: NestedKey = "cost_advantage"
+    cost_value_target: NestedKey = "cost_value_target"
+
+
+def written(network: TensorDictModule, key: NestedKey) -> NestedKey:
+    """What a network calls its value: ``key``, or else the first of its entries."""
+    return key if key in network.out_keys else network.out_keys[0]
+
+
+class CostValueMixin(LossMixin):
+    r"""A cost critic V_c(s), a second GAE and their loss, for an on-policy loss of TorchRL.
+
+    .. math::
+
+        L_c = E[\tfrac12 (V_c(s) - G_c)^2]
+
+    with :math:`G_c` the cost's value target, TD(lambda). Comes first among the bases, as in
+    ``class PPOLagLoss(CostValueMixin, ClipPPOLoss)``. The subclass calls :meth:`add_cost_value` once its other networks
+    are there, and names in ``input_networks`` and ``input_entries`` what its ``forward`` reads.
+
+    A limit on an episode's cost is about the episode, so the cost's estimator stops where one is ``done``. The
+    reward's goes on through a truncation, as everywhere. Both go on where a batch cuts an episode off.
+    """
+
+    #: Networks whose inputs the subclass's ``forward`` reads.
+    input_networks: ClassVar[tuple[str, ...]]
+    #: Entries that it reads, by their names in ``tensor_keys``.
+    input_entries: ClassVar[tuple[str, ...]]
 
     cost_critic: TensorDictModule
     cost_critic_params: TensorDictParams
     target_cost_critic_params: TensorDictParams
 
-    #: What a subclass's forward reads: the observations of these networks, and these entries, by
-    #: their names in ``tensor_keys``.
-    _networks: tuple[str, ...]
-    _entries: tuple[str, ...]
-
-    # Of the loss beside this base, or made late.
-    tensor_keys: Any
+    # Of the loss beside this one, or made late.
+    critic_network: TensorDictModule
     critic_network_params: TensorDictParams
     target_critic_network_params: TensorDictParams
-    _value_estimator: Any
     _cost_value_estimator: Any
 
-    def _add_cost_value(self, cost_critic: TensorDictModule) -> None:
+    def add_cost_value(self, cost_critic: TensorDictModule) -> None:
+        """Take the cost critic in, and make the estimators, by the names that the two values have."""
         self.convert_to_functional(cost_critic, "cost_critic")
-        self._cost_value_estimator = None
-        # Made here, not at the first call: a fresh loss then loads a state_dict strictly.
-        self.make_value_estimator(ValueEstimators.GAE)
+        self.set_keys(
+            value=written(self.critic_network, self.tensor_keys.value),
+            state_cost_value=written(cost_critic, self.tensor_keys.state_cost_value),
+        )
+        # Asked for now, so that a fresh loss loads a state_dict strictly.
+        _ = self.value_estimator
 
-    def make_value_estimator(self, value_type: Any = None, **hyperparams) -> None:
+    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
         """Build the advantage estimators of the reward and of the cost, alike.
 
         Args:
@@ -62,16 +91,16 @@ class CostValueLoss(LossModule):
         """
         check_gamma(hyperparams)
         super().make_value_estimator(value_type, **hyperparams)
-        self._cost_value_estimator = deepcopy(self._value_estimator)
+        self._cost_value_estimator = deepcopy(self.value_estimator)
         # The copy shares the functional network's structure only; whose values it takes is said here.
         self._cost_value_estimator.value_network = self.cost_critic
-        self._forward_value_estimator_keys()
+        self.set_keys()  # no other ones: both estimators are told
 
-    def _forward_value_estimator_keys(self, **kwargs) -> None:
-        super()._forward_value_estimator_keys(**kwargs)  # pyright: ignore
-        if getattr(self, "_cost_value_estimator", None) is not None:
+    def name_keys(self) -> None:
+        estimator = getattr(self, "_cost_value_estimator", None)
+        if estimator is not None:
             keys = self.tensor_keys
-            self._cost_value_estimator.set_keys(
+            estimator.set_keys(
                 advantage=keys.cost_advantage,
                 value_target=keys.cost_value_target,
                 value=keys.state_cost_value,
@@ -80,21 +109,24 @@ class CostValueLoss(LossModule):
                 terminated=keys.done,
             )
 
-    def _set_in_keys(self) -> None:
+    def read_keys(self) -> list[NestedKey]:
         # The other base asks before the cost critic is there.
-        networks = [getattr(self, name) for name in self._networks if hasattr(self, name)]
+        networks = [getattr(self, name) for name in self.input_networks if hasattr(self, name)]
         keys = [key for network in networks for key in network.in_keys]
-        keys += [getattr(self.tensor_keys, name) for name in self._entries]
-        self._in_keys = list(dict.fromkeys(keys))
+        keys += [getattr(self.tensor_keys, name) for name in self.input_entries]
+        return list(dict.fromkeys(keys))
 
     @torch.no_grad()
     def begin(self, tensordict: TensorDictBase) -> None:
-        """Write the advantages of a batch of fresh transitions.
+        """Write the advantages and value targets of a batch of fresh transitions, before it is cut into mini-batches.
 
         Args:
-            tensordict: ``[*B, T]`` with ``("next", "reward")`` and ``("next", "cost")``; gets
-                ``"advantage"``, ``"value_target"``, ``"cost_advantage"``, ``"cost_value_target"``
-                and the values themselves, ``[*B, T, 1]``.
+            tensordict: ``[*B, T]``.
+
+        Reads the value networks' inputs at the root and under ``"next"``; under ``"next"``: ``"reward"``, ``"cost"``
+            ``[*B, T, 1]`` in their units, ``"done"``, ``"terminated"`` ``[*B, T, 1]``.
+        Writes ``"state_value"``, ``"advantage"``, ``"value_target"`` in the unit of the reward; ``"state_cost_value"``,
+            ``"cost_advantage"``, ``"cost_value_target"`` in the unit of the cost; all ``[*B, T, 1]``.
 
         Raises:
             KeyError: the batch holds no cost.
@@ -102,7 +134,7 @@ class CostValueLoss(LossModule):
         check_cost(tensordict, self.tensor_keys.cost)
         for estimator, params, target_params in (
             (
-                self._value_estimator,
+                self.value_estimator,
                 self.critic_network_params,
                 self.target_critic_network_params,
             ),
@@ -115,10 +147,13 @@ class CostValueLoss(LossModule):
             estimator(tensordict, params=params.detach(), target_params=target_params)
 
     def cost_loss(self, tensordict: TensorDictBase) -> Tensor:
-        """Half the squared error of V_c against ``"cost_value_target"``, reduced.
+        """Half the squared error of V_c(s) against ``"cost_value_target"``, reduced.
 
         Args:
             tensordict: ``[*B]`` as :meth:`begin` leaves it.
+
+        Raises:
+            KeyError: ``begin`` has not seen the batch.
         """
         check_begun(tensordict, self.tensor_keys.cost_value_target)
         with self.cost_critic_params.to_module(self.cost_critic, preserve_module_state=False):
@@ -126,4 +161,4 @@ class CostValueLoss(LossModule):
             predicted = self.cost_critic(inputs).get(self.tensor_keys.state_cost_value)
         target = tensordict.get(self.tensor_keys.cost_value_target)
         loss = 0.5 * distance_loss(predicted, target, loss_function="l2").squeeze(-1)
-        return self._reduce_loss(loss, tensordict)
+        return self.reduced(loss, tensordict)

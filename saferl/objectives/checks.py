@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, get_args
 
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 
 from saferl.modules import LagrangeMultiplier
+
+
+def check_choice(name: str, value: Any, choices: Any) -> Any:
+    """A value that is one of a ``Literal``'s.
+
+    Raises:
+        ValueError: it is another one; names the key, the value and the choices.
+    """
+    if value not in get_args(choices):
+        raise ValueError(f"{name} must be one of {', '.join(get_args(choices))}, got {value!r}.")
+    return value
 
 
 def check_limit(cost_limit: float) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -13,10 +14,9 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent, TransformedDistribution, kl_divergence
 from torchrl.objectives import PPOLoss
 
-from saferl.objectives.advantages import CostValueLoss
+from saferl.objectives.advantages import CostValueKeys, CostValueMixin
 from saferl.objectives.checks import check_begun, check_limit
 from saferl.objectives.episodes import EpisodeCost
-from saferl.objectives.ppo import CostKeys
 from saferl.objectives.trust_region import (
     CASES,
     conjugate_gradient,
@@ -38,8 +38,9 @@ def policy_kl(old: Distribution, new: Distribution) -> Tensor:
     return kl_divergence(old, new)
 
 
-class CPOKeys(CostKeys):
-    """Keys that ``set_keys`` accepts beside those of PPOLagLoss.
+@dataclass
+class CPOKeys(CostValueKeys):
+    """Keys that ``set_keys`` accepts beside those of :class:`~saferl.objectives.PPOLagLoss`.
 
     Attributes:
         is_init: whether a transition is an episode's first.
@@ -48,7 +49,7 @@ class CPOKeys(CostKeys):
     is_init: NestedKey = "is_init"
 
 
-class CPOLoss(CostValueLoss, PPOLoss):
+class CPOLoss(CostValueMixin, PPOLoss):
     r"""A policy's trust-region step under a cost constraint, and the losses of its two value networks.
 
     For a batch of fresh transitions :meth:`begin` estimates the advantages and then moves the policy:
@@ -126,8 +127,8 @@ class CPOLoss(CostValueLoss, PPOLoss):
 
     _AcceptedKeys = CPOKeys
     default_keys = CPOKeys
-    _networks = ("critic_network", "cost_critic")
-    _entries = ("value_target", "cost_value_target")
+    input_networks = ("critic_network", "cost_critic")
+    input_entries = ("value_target", "cost_value_target")
 
     cost_limit: Tensor
     report: Tensor
@@ -166,9 +167,9 @@ class CPOLoss(CostValueLoss, PPOLoss):
             separate_losses=separate_losses,
             reduction=reduction,
         )
-        self._add_cost_value(cost_critic)
-        device = next(self.parameters()).device
-        self.register_buffer("cost_limit", torch.tensor(check_limit(cost_limit), device=device))
+        self.add_cost_value(cost_critic)
+        device = self.buffer_device
+        self.register_coeff_buffer("cost_limit", check_limit(cost_limit), device=device)
         self.out_keys = ["loss_critic", "loss_cost", "explained_variance", "kl", "cost_estimate"]
         self.out_keys += ["step_fraction", *(f"cpo_{name}" for name in CASES)]
         self.trust, self.cg_steps, self.damping = trust, cg_steps, damping
@@ -182,7 +183,7 @@ class CPOLoss(CostValueLoss, PPOLoss):
         """Write the advantages of a batch of fresh transitions, and move the policy by one step.
 
         Args:
-            tensordict: ``[*B, T]``; gets what :meth:`CostValueLoss.begin` writes.
+            tensordict: ``[*B, T]``; gets what :meth:`CostValueMixin.begin` writes.
 
         Raises:
             KeyError: no cost, or no ``is_init``.
@@ -205,7 +206,7 @@ class CPOLoss(CostValueLoss, PPOLoss):
         the first end, what the running episodes have cost so far and V_c of the rest, as if they went on for ever.
 
         Args:
-            tensordict: ``[*B, T]`` as :meth:`CostValueLoss.begin` leaves it; ``"is_init"`` (of TorchRL's
+            tensordict: ``[*B, T]`` as :meth:`CostValueMixin.begin` leaves it; ``"is_init"`` (of TorchRL's
                 ``InitTracker``) tells where episodes begin.
 
         Returns:
@@ -327,7 +328,7 @@ class CPOLoss(CostValueLoss, PPOLoss):
         kl, cost, fraction, case = self.report.clone().unbind()
         out = TensorDict(
             {
-                "loss_critic": self._reduce_loss(loss_critic, tensordict).squeeze(-1),
+                "loss_critic": self.reduced(loss_critic, tensordict).squeeze(-1),
                 "loss_cost": self.cost_loss(tensordict),
                 "explained_variance": explained,
                 "kl": kl,
@@ -336,7 +337,7 @@ class CPOLoss(CostValueLoss, PPOLoss):
                 **{f"cpo_{name}": (case == i).float() for i, name in enumerate(CASES)},
             }
         )
-        self._clear_weakrefs(
+        self.release(
             tensordict,
             out,
             "actor_network_params",

@@ -1,4 +1,4 @@
-"""Proximal policy optimisation under a Lagrangian cost constraint."""
+"""Proximal policy optimisation under a Lagrangian cost constraint (Ray, Achiam and Amodei, 2019)."""
 
 from __future__ import annotations
 
@@ -14,29 +14,13 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.utils import distance_loss
 
 from saferl.modules import BoundCritics, CriticEnsemble, LagrangeMultiplier, Largest
-from saferl.objectives.advantages import CostValueLoss
+from saferl.objectives.advantages import CostValueKeys, CostValueMixin
 from saferl.objectives.checks import check_begun, check_lagrange
 from saferl.objectives.cost import quantile_loss
 
 
-@dataclass
-class CostKeys(ClipPPOLoss._AcceptedKeys):
-    """Keys that ``set_keys`` accepts beside those of ClipPPOLoss.
-
-    Attributes:
-        cost: the cost under ``"next"``.
-        state_cost_value: what the cost critic writes.
-        cost_advantage, cost_value_target: written by ``begin``, read by the loss.
-    """
-
-    cost: NestedKey = "cost"
-    state_cost_value: NestedKey = "state_cost_value"
-    cost_advantage: NestedKey = "cost_advantage"
-    cost_value_target: NestedKey = "cost_value_target"
-
-
-class PPOLagLoss(CostValueLoss, ClipPPOLoss):
-    r"""Clipped PPO with a cost critic and a Lagrange multiplier (Ray et al., 2019).
+class PPOLagLoss(CostValueMixin, ClipPPOLoss):
+    r"""Clipped PPO with a cost critic and a Lagrange multiplier (Ray, Achiam and Amodei, 2019).
 
     .. math::
 
@@ -44,30 +28,34 @@ class PPOLagLoss(CostValueLoss, ClipPPOLoss):
         L_\pi &= -E[\min(\rho \hat A, \mathrm{clip}(\rho, 1 - \epsilon, 1 + \epsilon) \hat A)] \\
         L_c &= E[\tfrac12 (V_c(s) - G_c)^2]
 
-    with :math:`\rho` the ratio of the new policy's probability to the one that acted. The sum is
-    standardised after the two advantages are weighed, never one of them before, so that the multiplier is
-    in units of reward per cost. The multiplier is moved by the loop, once for each batch of fresh episodes:
+    with :math:`\rho` the ratio of the new policy's probability to that of the policy that acted. The advantages are
+    weighed first, and their sum is standardised: the multiplier stays in units of reward per cost.
+
+    The multiplier is not trained here. A loop moves it once for each batch of fresh episodes, with
     ``loss.lagrange.update(loss.lagrange.penalty(episode_cost - limit))``.
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): the policy.
-        critic_network (TensorDictModule): V(s); writes ``"state_value"``.
-        cost_critic (TensorDictModule): V_c(s); writes ``"state_cost_value"``.
+        critic_network (TensorDictModule): V(s).
+        cost_critic (TensorDictModule): V_c(s).
 
     Keyword Args:
         lagrange (LagrangeMultiplier): the multiplier, saved with the loss.
-        clip_epsilon, entropy_bonus, entropy_coeff, critic_coeff, clip_value, loss_critic_type,
-            normalize_advantage, separate_losses, reduction: as in
-            :class:`~torchrl.objectives.ClipPPOLoss`. Defaults here: ``entropy_bonus=False``,
-            ``normalize_advantage=True`` (of each batch that the loss is given), ``loss_critic_type="l2"``.
+        normalize_advantage (bool, optional): standardise the weighed advantage over each batch that the loss is given.
+            Defaults to ``True``.
+        clip_epsilon, entropy_bonus, entropy_coeff, critic_coeff, clip_value, loss_critic_type, separate_losses,
+            reduction: as in :class:`~torchrl.objectives.ClipPPOLoss`. Defaults here: ``entropy_bonus=False``,
+            ``loss_critic_type="l2"``.
 
-    Reads what :meth:`begin` leaves in a batch, in any batch shape ``[*B]``.
-    Writes ``"loss_objective"``, ``"loss_critic"``, ``"loss_cost"``, ClipPPOLoss's reports and
-    ``"lagrange_multiplier"``.
+    Reads what :meth:`begin` leaves in a batch, in any batch shape ``[*B]``: the networks' inputs; ``"action"``
+        ``[*B, A]``, the policy's own, and its ``"action_log_prob"`` ``[*B]``; ``"advantage"`` and ``"value_target"`` in the
+        unit of the reward, ``"cost_advantage"`` and ``"cost_value_target"`` in the unit of the cost, ``[*B, 1]``.
+    Writes ``"loss_objective"``, ``"loss_critic"``, ``"loss_cost"``: scalars, or ``[*B]`` without reduction; the reports of
+        :class:`~torchrl.objectives.ClipPPOLoss`; the scalar ``"lagrange_multiplier"`` (reward per cost).
 
     Raises:
-        ValueError: ``clip_epsilon`` is not positive, ``lagrange`` is no multiplier, or ``gamma`` lies outside [0, 1].
-        KeyError: the batch holds no cost, or ``begin`` has not seen it.
+        ValueError: ``clip_epsilon`` is not positive; ``lagrange`` is no multiplier; ``gamma`` lies outside [0, 1].
+        KeyError: the batch holds no cost; ``begin`` has not seen it.
 
     Examples:
         >>> import torch
@@ -94,10 +82,10 @@ class PPOLagLoss(CostValueLoss, ClipPPOLoss):
         >>> sum(value for key, value in output.items() if key.startswith("loss_")).backward()
     """
 
-    _AcceptedKeys = CostKeys
-    default_keys = CostKeys
-    _networks = ("actor_network", "critic_network", "cost_critic")
-    _entries = (
+    _AcceptedKeys = CostValueKeys
+    default_keys = CostValueKeys
+    input_networks = ("actor_network", "critic_network", "cost_critic")
+    input_entries = (
         *("action", "sample_log_prob", "advantage", "value_target"),
         *("cost_advantage", "cost_value_target"),
     )
@@ -136,7 +124,7 @@ class PPOLagLoss(CostValueLoss, ClipPPOLoss):
             separate_losses=separate_losses,
             reduction=reduction,
         )
-        self._add_cost_value(cost_critic)
+        self.add_cost_value(cost_critic)
         self.lagrange = check_lagrange(lagrange)
         self.out_keys = [*self.out_keys, "loss_cost", "lagrange_multiplier"]
 
@@ -149,16 +137,15 @@ class PPOLagLoss(CostValueLoss, ClipPPOLoss):
         multiplier = self.lagrange.value.detach().to(reward)
         weighed = tensordict.clone(False)
         weighed.set(self.tensor_keys.advantage, (reward - multiplier * cost) / (1.0 + multiplier))
-        # By name: LossModule gives each of its subclasses a forward, so that super() would find the base's.
-        out = ClipPPOLoss.forward(self, weighed)
+        out = super().forward(weighed)
         out.set("loss_cost", self.cost_loss(tensordict))
         out.set("lagrange_multiplier", self.lagrange.value.detach().clone())
-        self._clear_weakrefs(tensordict, out, "cost_critic_params", "target_cost_critic_params")
+        self.release(tensordict, out, "cost_critic_params", "target_cost_critic_params")
         return out
 
 
 @dataclass
-class RiskKeys(CostKeys):
+class RiskKeys(CostValueKeys):
     """Keys that ``set_keys`` accepts beside those of :class:`PPOLagLoss`.
 
     Attributes:
@@ -175,27 +162,28 @@ class RiskPPOLoss(PPOLagLoss):
 
     .. math::
 
-        L = L_{PPO-Lag} + E\Big[\sum_i \tfrac12 (Q_{c,i}(s, \bar a) - G_c)^2\Big]
+        L_{risk} = E\Big[\sum_i \tfrac12 (Q_{c,i}(s, \bar a) - G_c)^2\Big]
 
-    with :math:`\bar a` the action that was executed and :math:`G_c` the cost's value target, the TD(lambda) return
-    that followed it. The policy's own terms keep the action that it proposed, whose log-probability it knows; the
-    correction is a part of what it acts on.
+    beside the terms of :class:`PPOLagLoss`, with :math:`\bar a` the action that was executed and :math:`G_c` the cost's
+    value target, the TD(lambda) return that followed it (ours; the critic is that of E13 in
+    :class:`~saferl.objectives.SACLagLoss`). The policy's own terms keep the action that it proposed, whose
+    log-probability it knows: the correction is a part of what it acts on.
 
     Args:
         actor_network, critic_network, cost_critic: as in :class:`PPOLagLoss`.
-        risk_critic (list of TensorDictModule): the members of Q_c(s, a), at least two; write
-            ``"state_action_cost_value"``.
+        risk_critic (list of TensorDictModule): the members of Q_c(s, a), at least two.
 
     Keyword Args:
-        risk (callable, optional): what :attr:`cost_value` makes of the members' values ``[n, *B, 1]``. Defaults to
+        risk (callable, optional): what :attr:`cost_value` makes of the members' values ``[n, *B, K]``. Defaults to
             :class:`~saferl.modules.Largest`.
         **settings: as in :class:`PPOLagLoss`.
 
-    Reads as :class:`PPOLagLoss`, and ``("next", "action_executed")`` ``[*B, A]`` where a projector wrote it.
-    Writes besides ``"loss_risk"``.
+    Reads what :class:`PPOLagLoss` does, and ``("next", "action_executed")`` ``[*B, A]`` where a projector wrote it.
+    Writes what :class:`PPOLagLoss` does, and ``"loss_risk"``: a scalar, or ``[*B]`` without reduction.
 
     Raises:
-        ValueError: as :class:`PPOLagLoss`; fewer than two members.
+        ValueError: as :class:`PPOLagLoss`; ``risk_critic`` has fewer than two members.
+        KeyError: as :class:`PPOLagLoss`.
 
     Examples:
         >>> from saferl.modules import (
@@ -277,17 +265,21 @@ class RiskPPOLoss(PPOLagLoss):
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        out = PPOLagLoss.forward(self, tensordict)
+        out = super().forward(tensordict)
         out.set("loss_risk", self.risk_loss(tensordict))
-        self._clear_weakrefs(tensordict, out, "risk_critic_params", "target_risk_critic_params")
+        self.release(tensordict, out, "risk_critic_params", "target_risk_critic_params")
         return out
 
     def risk_loss(self, tensordict: TensorDictBase) -> Tensor:
-        """Half the squared error of each Q_c(s, a) against ``"cost_value_target"``, or, of critics with K > 1 outputs,
-        the loss of their quantiles, summed and reduced.
+        """The loss of Q_c(s, a), summed over its members and reduced.
+
+        Half the squared error against ``"cost_value_target"``, or, of critics with K > 1 outputs, :func:`quantile_loss`.
 
         Args:
             tensordict: ``[*B]`` as :meth:`begin` leaves it.
+
+        Raises:
+            KeyError: ``begin`` has not seen the batch.
         """
         keys = self.tensor_keys
         check_begun(tensordict, keys.cost_value_target)
@@ -298,6 +290,6 @@ class RiskPPOLoss(PPOLagLoss):
         predicted = critics.values(action)
         target = tensordict.get(keys.cost_value_target)
         if predicted.shape[-1] > 1:
-            return self._reduce_loss(quantile_loss(predicted, target).sum(0), tensordict)
+            return self.reduced(quantile_loss(predicted, target).sum(0), tensordict)
         loss = 0.5 * distance_loss(predicted, target.expand_as(predicted), loss_function="l2")
-        return self._reduce_loss(loss.sum(0).squeeze(-1), tensordict)
+        return self.reduced(loss.sum(0).squeeze(-1), tensordict)
