@@ -1,22 +1,28 @@
-"""Cost critics beside the reward critics of an off-policy loss (E13)."""
+"""Cost critics beside the reward critics of an off-policy loss.
+
+E13 is equation (11) of the paper, `arXiv 2503.19690 <https://arxiv.org/abs/2503.19690>`_, by its label there.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from copy import deepcopy
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase, TensorDictParams, unravel_key
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import distance_loss
 
 from saferl.modules import BoundCritics, CriticEnsemble, LagrangeMultiplier, Largest
 from saferl.modules.critics import REDUCTIONS
+from saferl.objectives.adapter import LossMixin
 from saferl.objectives.checks import (
+    check_choice,
     check_cost,
     check_gamma,
     check_lagrange,
@@ -25,9 +31,9 @@ from saferl.objectives.checks import (
 )
 
 #: What the cost critics' target may be of its members' values.
-COST_TARGETS = ("max", "mean")
+CostTarget = Literal["max", "mean"]
 #: What the cost critics may learn: the discounted sum of costs, or the largest one ahead.
-COST_BACKUPS = ("sum", "reach")
+CostBackup = Literal["sum", "reach"]
 
 
 def quantile_loss(predicted: Tensor, target: Tensor) -> Tensor:
@@ -50,25 +56,41 @@ def quantile_loss(predicted: Tensor, target: Tensor) -> Tensor:
     return torch.maximum(fraction * error, (fraction - 1.0) * error).mean(-1).sum(-1)
 
 
-class CostCriticLoss(LossModule):
-    r"""Base of the losses of an off-policy critic under a cost constraint.
+@dataclass
+class SharedTerms:
+    """What the terms of one forward pass have in common.
 
-    Comes before a loss of TorchRL among the bases of a class, as in
-    ``class SACLagLoss(CostCriticLoss, SACLoss)``, and gives it an ensemble of cost
-    critics with targets, a second value estimator, which reads the cost, and
+    Attributes:
+        tensordict: the batch that the pass is of.
+        next_sample: of :meth:`CostCriticMixin.sample_next`.
+        critics: bound to the batch's states, by the names of their networks.
+        violation: what the actor's term leaves here: ``"constraint_violation"``.
+    """
+
+    tensordict: TensorDictBase
+    next_sample: tuple[TensorDictBase, Tensor]
+    critics: dict[str, BoundCritics]
+    violation: Tensor | None = None
+
+
+class CostCriticMixin(LossMixin):
+    r"""An ensemble of cost critics with targets, a second value estimator and their loss, for an off-policy loss.
 
     .. math::
 
         L_c = E\Big[\sum_i \tfrac12 \big(Q_{c,i}(s, a) - c
-              - \gamma (1 - \tau) \max_j Q^-_{c,j}(s', \tilde a')\big)^2\Big] \quad (E13, paper)
+              - \gamma (1 - \tau) \max_j Q^-_{c,j}(s', \tilde a')\big)^2\Big] \quad (E13)
 
-    where :math:`\tau` is ``terminated``, and the mean over :math:`j` may take the place of
-    the maximum (``cost_target="mean"``): the maximum of members that differ by chance is
-    too high, and each target passes that on to the next one. With ``cost_backup="reach"`` the target is
-    :math:`(1 - \gamma) c + \gamma \max(c, (1 - \tau) Q_c^-)`, whose fixed point is the discounted largest cost
-    ahead (Fisac et al., 2019). A critic with K > 1 outputs learns the quantiles of the sum, by
-    :func:`quantile_loss`. What is made of the members' values elsewhere is ``risk``. The subclass calls
-    :meth:`_add_cost_critic` once its other networks are there, and defines :meth:`_sample_next`.
+    with :math:`\tau` the entry ``"terminated"`` and :math:`\tilde a'` drawn from the policy. Comes first among the bases,
+    as in ``class SACLagLoss(CostCriticMixin, SACLoss)``. The subclass calls :meth:`add_cost_critic` once its other
+    networks are there, and defines :meth:`sample_next`.
+
+    - ``cost_target="mean"`` takes the mean over :math:`j` in place of the maximum. The maximum of members that differ
+      by chance is too high, and each target passes that on to the next one.
+    - ``cost_backup="reach"`` has the target :math:`(1 - \gamma) c + \gamma \max(c, (1 - \tau) Q_c^-)`. Its fixed point
+      is the discounted largest cost ahead (Fisac et al., 2019).
+    - A critic with K > 1 outputs learns the quantiles of the sum, by :func:`quantile_loss`.
+    - ``risk`` is what is made of the members' values everywhere else.
     """
 
     SUPPORTED_VALUE_ESTIMATORS = (ValueEstimators.TD0,)
@@ -78,47 +100,42 @@ class CostCriticLoss(LossModule):
     target_cost_critic_params: TensorDictParams
     lagrange: LagrangeMultiplier
     cost_limit: Tensor
-    cost_target: str
-    cost_backup: str
+    cost_target: CostTarget
+    cost_backup: CostBackup
     risk: Callable[[Tensor], Tensor]
 
-    # Of the loss beside this base, or made late.
-    tensor_keys: Any
+    # Of the loss beside this one, or made late.
     actor_network: TensorDictModule
     qvalue_network: TensorDictModule
     deactivate_vmap: bool
-    _value_estimator: Any
     _cost_value_estimator: Any
+    _shared: SharedTerms | None = None
 
-    def _add_cost_critic(
+    def add_cost_critic(
         self,
         cost_critic: TensorDictModule | list[TensorDictModule],
         num_cost_critics: int | None,
         *,
         lagrange: LagrangeMultiplier,
         cost_limit: float,
-        cost_target: str,
-        cost_backup: str,
+        cost_target: CostTarget,
+        cost_backup: CostBackup,
         risk: Callable[[Tensor], Tensor] | None,
         create_target_params: bool,
         compare_against: list[nn.Parameter] | None,
     ) -> None:
+        """Take the cost critics in, with what their loss and the actor's need, and make the estimators."""
         cost_limit = check_limit(cost_limit)
-        num_cost_critics = count_members(
+        self.num_cost_critics = count_members(
             "cost_critic", cost_critic, "num_cost_critics", num_cost_critics
         )
-        for name, value, choices in (
-            ("cost_target", cost_target, COST_TARGETS),
-            ("cost_backup", cost_backup, COST_BACKUPS),
-        ):
-            if value not in choices:
-                raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}.")
-        self.num_cost_critics, self.cost_target = num_cost_critics, cost_target
-        self.cost_backup, self.risk = cost_backup, risk or Largest()
+        self.cost_target = check_choice("cost_target", cost_target, CostTarget)
+        self.cost_backup = check_choice("cost_backup", cost_backup, CostBackup)
+        self.risk = risk or Largest()
         self.convert_to_functional(
             cost_critic,  # pyright: ignore[reportArgumentType]
             "cost_critic",
-            num_cost_critics,
+            self.num_cost_critics,
             create_target_params=create_target_params,
             compare_against=compare_against,
         )
@@ -127,16 +144,11 @@ class CostCriticLoss(LossModule):
                 f"risk must be a function, such as saferl.modules.Largest(), got {risk!r}."
             )
         self.lagrange = check_lagrange(lagrange)
-        device = next(self.parameters()).device
-        self.register_buffer("cost_limit", torch.tensor(cost_limit, device=device))
-        # Made here, not at the first call: a fresh loss then loads a state_dict strictly.
-        self._default_value_estimator()
+        self.register_coeff_buffer("cost_limit", cost_limit, device=self.buffer_device)
+        # Asked for now, so that a fresh loss loads a state_dict strictly.
+        _ = self.value_estimator
 
-    def make_value_estimator(
-        self,
-        value_type: Any = None,
-        **hyperparams,
-    ) -> None:
+    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
         """Build the value estimators of the reward and of the cost, alike.
 
         Args:
@@ -149,50 +161,41 @@ class CostCriticLoss(LossModule):
         """
         check_gamma(hyperparams)
         super().make_value_estimator(value_type, **hyperparams)
-        self._cost_value_estimator = deepcopy(self._value_estimator)
-        self._forward_value_estimator_keys()
+        self._cost_value_estimator = deepcopy(self.value_estimator)
+        self.set_keys()  # no other ones: both estimators are told
 
-    def _forward_value_estimator_keys(self, **kwargs) -> None:
-        # The other base calls this before the cost critic is known, so the input keys
-        # are left to be worked out when somebody asks for them.
-        self._in_keys = None
-        if self._value_estimator is None:
-            return
-        shared = {"done": self.tensor_keys.done, "terminated": self.tensor_keys.terminated}
-        self._value_estimator.set_keys(
-            value=self.tensor_keys.value, reward=self.tensor_keys.reward, **shared
-        )
-        self._cost_value_estimator.set_keys(
-            value=self.tensor_keys.state_action_cost_value, reward=self.tensor_keys.cost, **shared
-        )
+    def name_keys(self) -> None:
+        estimator = getattr(self, "_cost_value_estimator", None)
+        if estimator is not None:
+            keys = self.tensor_keys
+            estimator.set_keys(
+                value=keys.state_action_cost_value,
+                reward=keys.cost,
+                done=keys.done,
+                terminated=keys.terminated,
+            )
 
     @property
-    def _observation_keys(self) -> list[NestedKey]:
-        networks = (self.actor_network, self.qvalue_network, self.cost_critic)
+    def observation_keys(self) -> list[NestedKey]:
+        """What the networks read of a state."""
+        # The other base asks before the cost critic is there.
+        names = ("actor_network", "qvalue_network", "cost_critic")
+        networks = [getattr(self, name) for name in names if hasattr(self, name)]
         keys = dict.fromkeys(key for network in networks for key in network.in_keys)
         keys.pop(self.tensor_keys.action, None)
         return list(keys)
 
-    def _set_in_keys(self) -> None:
-        following = [
-            *self._observation_keys,
-            self.tensor_keys.reward,
-            self.tensor_keys.cost,
-            self.tensor_keys.done,
-            self.tensor_keys.terminated,
-        ]
-        self._in_keys = [
-            self.tensor_keys.action,
-            *self._observation_keys,
-            *(unravel_key(("next", key)) for key in following),
-        ]
+    def read_keys(self) -> list[NestedKey]:
+        keys, observation = self.tensor_keys, self.observation_keys
+        following = [*observation, keys.reward, keys.cost, keys.done, keys.terminated]
+        return [keys.action, *observation, *(unravel_key(("next", key)) for key in following)]
 
     @property
     def cost_value(self) -> CriticEnsemble:
         """The risk of the members' cost values, on their live parameters.
 
-        A view that owns no state. It keeps following the parameters as they are
-        trained and loaded, but not a ``to(device)`` that replaces them: take it anew.
+        A view that owns no state. It follows the parameters as they are trained and loaded. It does not follow a
+        ``to(device)`` that replaces them: take it anew.
         """
         return CriticEnsemble(
             self.cost_critic,
@@ -201,7 +204,11 @@ class CostCriticLoss(LossModule):
             action_key=self.tensor_keys.action,
         )
 
-    def _bind(
+    def sample_next(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
+        """Next state with an action of the policy, and its log-probability ``[*B]``."""
+        raise NotImplementedError
+
+    def bind(
         self, critic: TensorDictModule, params: TensorDictBase, tensordict: TensorDictBase
     ) -> BoundCritics:
         """All members of a critic in the batch's states."""
@@ -209,45 +216,53 @@ class CostCriticLoss(LossModule):
         key = self.tensor_keys.action
         return BoundCritics.of(critic, params, tensordict, action_key=key, vmap=vmap)
 
-    def cost_loss(
-        self,
-        tensordict: TensorDictBase,
-        next_sample: tuple[TensorDictBase, Tensor] | None = None,
-        critics: BoundCritics | None = None,
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """E13: cost critics against the target value or its quantiles, with no entropy.
+    def shared(self, tensordict: TensorDictBase) -> SharedTerms | None:
+        """What a forward pass of this very batch has made already; None where a term is asked for alone."""
+        shared = self._shared
+        return shared if shared is not None and shared.tensordict is tensordict else None
+
+    def next_sample(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
+        """:meth:`sample_next`, once for all terms of a forward pass."""
+        shared = self.shared(tensordict)
+        return self.sample_next(tensordict) if shared is None else shared.next_sample
+
+    def critics(
+        self, name: Literal["qvalue_network", "cost_critic"], tensordict: TensorDictBase
+    ) -> BoundCritics:
+        """All members of a critic in the batch's states, bound once for all terms of a forward pass."""
+        shared = self.shared(tensordict)
+        if shared is not None:
+            return shared.critics[name]
+        return self.bind(getattr(self, name), getattr(self, f"{name}_params"), tensordict)
+
+    def cost_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """E13 with its options: cost critics against the target value or its quantiles, with no entropy.
 
         Args:
-            tensordict (TensorDictBase): the batch.
-            next_sample (optional): next state with the policy's action, and its
-                log-probability ``[*B]``. Drawn afresh by default.
-            critics (optional): the cost critics bound to the batch's states, where
-                they are known already.
+            tensordict: the batch ``[*B]``.
+
+        Returns:
+            The loss, reduced, and ``"td_error"`` ``[*B]``, the largest over the members.
 
         Raises:
             KeyError: the batch holds no cost.
         """
         check_cost(tensordict, self.tensor_keys.cost)
-        next_state, _ = next_sample or self._sample_next(tensordict)
+        next_state, _ = self.next_sample(tensordict)
         with torch.no_grad():
-            target_critics = self._bind(
-                self.cost_critic, self.target_cost_critic_params, next_state
-            )
+            target_critics = self.bind(self.cost_critic, self.target_cost_critic_params, next_state)
             next_value = target_critics.values(next_state.get(self.tensor_keys.action))
             next_value = REDUCTIONS[self.cost_target](next_value)
-            target = self._cost_backup(tensordict, next_value)
-        critics = critics or self._bind(self.cost_critic, self.cost_critic_params, tensordict)
+            target = self.backup(tensordict, next_value)
+        critics = self.critics("cost_critic", tensordict)
         predicted = critics.values(tensordict.get(self.tensor_keys.action))
         if predicted.shape[-1] == 1:
-            return self._bellman_loss(predicted, target, tensordict)
+            return self.bellman_loss(predicted, target, tensordict)
         loss = quantile_loss(predicted, target.expand_as(predicted)).sum(0)
-        loss = self._reduce_loss(
-            loss, tensordict=tensordict, weights=self._maybe_get_priority_weight(tensordict)
-        )
         error = predicted.mean(-1) - target.mean(-1)
-        return loss, {"td_error": error.detach().abs().max(0)[0]}
+        return self.reduced(loss, tensordict), {"td_error": error.detach().abs().max(0)[0]}
 
-    def _cost_backup(self, tensordict: TensorDictBase, next_value: Tensor) -> Tensor:
+    def backup(self, tensordict: TensorDictBase, next_value: Tensor) -> Tensor:
         """The cost critics' target [*B, K] from the next state's values [*B, K]."""
         estimator = self._cost_value_estimator
         if self.cost_backup == "sum":
@@ -263,18 +278,12 @@ class CostCriticLoss(LossModule):
         gamma, ahead = estimator.gamma.to(cost), torch.where(terminated, 0.0, next_value)
         return (1.0 - gamma) * cost + gamma * torch.maximum(cost, ahead)
 
-    def _bellman_loss(
+    def bellman_loss(
         self, predicted: Tensor, target: Tensor, tensordict: TensorDictBase
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """Half the squared error of ``predicted`` ``[n, *B, 1]``, summed over its members."""
         predicted = predicted.squeeze(-1)
         target = target.squeeze(-1).expand_as(predicted)
         loss = 0.5 * distance_loss(predicted, target, loss_function="l2").sum(0)
-        loss = self._reduce_loss(
-            loss, tensordict=tensordict, weights=self._maybe_get_priority_weight(tensordict)
-        )
-        return loss, {"td_error": (predicted - target).detach().abs().max(0)[0]}
-
-    def _sample_next(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
-        """Next state with an action of the policy, and its log-probability ``[*B]``."""
-        raise NotImplementedError
+        error = (predicted - target).detach().abs().max(0)[0]
+        return self.reduced(loss, tensordict), {"td_error": error}

@@ -1,4 +1,8 @@
-"""Soft actor-critic under a Lagrangian cost constraint (E11 to E14)."""
+"""Soft actor-critic under a Lagrangian cost constraint.
+
+E11 to E14 are equations (8) and (10) to (12) of the paper, `arXiv 2503.19690 <https://arxiv.org/abs/2503.19690>`_, by
+their labels there.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
 from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
@@ -16,18 +20,17 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import SACLoss
 from torchrl.objectives.sac import compute_rsample_log_prob
 
-from saferl.modules import BoundCritics, LagrangeMultiplier
-from saferl.objectives.checks import count_members
-from saferl.objectives.cost import CostCriticLoss
+from saferl.modules import LagrangeMultiplier
+from saferl.objectives.adapter import SACTerms
+from saferl.objectives.checks import check_choice, count_members
+from saferl.objectives.cost import CostBackup, CostCriticMixin, CostTarget, SharedTerms
 
-_LOSSES = ("loss_actor", "loss_qvalue", "loss_cost", "loss_alpha")
-_SCALARS = ("alpha", "entropy", "lagrange_multiplier")
-_CRITICS = ("qvalue_network_params", "cost_critic_params")
-_PARAMS = ("actor_network_params", *_CRITICS, *(f"target_{name}" for name in _CRITICS))
+#: What weighs the entropy's distance from its target in the temperature's term.
+AlphaWeight = Literal["alpha", "log_alpha"]
 
 
-class SACLagLoss(CostCriticLoss, SACLoss):
-    r"""SAC with cost critics and a Lagrange multiplier (E11 to E14 of the paper).
+class SACLagLoss(CostCriticMixin, SACTerms):
+    r"""SAC with cost critics and a Lagrange multiplier.
 
     With :math:`Q = \min_i Q_i`, :math:`Q_c = \max_i Q_{c,i}` and one action
     :math:`\tilde a` drawn from the policy at each state:
@@ -42,62 +45,55 @@ class SACLagLoss(CostCriticLoss, SACLoss):
                Q_c^-(s', \tilde a'))^2]                                     & (E13) \\
         L_\alpha &= E[\alpha (-\log\pi(\tilde a|s) - H_0)]                  & (E14)
 
-    :math:`\tau` is ``terminated``: both targets bootstrap through ``truncated``.
-    :math:`d` is ``cost_limit`` and :math:`\rho` is ``lagrange.penalty``, a ReLU
-    for the paper's state-wise constraint. E12 and E13 share the one action
-    :math:`\tilde a'`, as the policy proposes it, and use target critics.
+    - :math:`\tau` is ``terminated``: both targets go on through ``truncated``.
+    - :math:`d` is ``cost_limit``.
+    - :math:`\rho` is ``lagrange.penalty``: a ReLU for the paper's state-wise constraint, taken for each sample before
+      the mean.
+    - E12 and E13 share the action :math:`\tilde a'`, which the policy proposes. They use target critics.
 
-    The gradient of a term reaches its own parameters only, so the four may be
-    summed and stepped together. The multiplier is never trained here; a loop
-    ascends it with ``loss.lagrange.update(output["constraint_violation"])``.
-    That entry is :math:`\partial L_\pi / \partial\lambda`, the batch mean of
-    :math:`\rho`: the ReLU is taken for each sample before the mean.
+    The gradient of a term reaches its own parameters only. The four may be summed and stepped together.
+
+    The multiplier is not trained here. A loop ascends it with ``loss.lagrange.update(output["constraint_violation"])``:
+    that entry is :math:`\partial L_\pi / \partial\lambda`, the batch mean of :math:`\rho`.
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): the policy.
-        qvalue_network (TensorDictModule or list of TensorDictModule): reward
-            critic. One module is copied and re-initialised for each member; a
-            list supplies the members and keeps their initial parameters.
-        cost_critic (TensorDictModule or list of TensorDictModule): likewise for
-            the cost; writes ``"state_action_cost_value"``.
+        qvalue_network (TensorDictModule or list of TensorDictModule): the reward critic. One module is copied for each
+            member and drawn anew. A list gives the members, with the parameters that they have.
+        cost_critic (TensorDictModule or list of TensorDictModule): likewise for the cost.
 
     Keyword Args:
         lagrange (LagrangeMultiplier): the multiplier, saved with the loss.
-        cost_limit (float, optional): bound on the discounted cost value, in the
-            unit of ``cost``. Defaults to ``0.05``.
-        cost_target ("max" or "mean", optional): what :math:`Q_c^-` is of the members of
-            the target. Defaults to ``"max"`` (paper), whose overestimate feeds itself.
-        cost_backup ("sum" or "reach", optional): what the cost critics learn, the discounted sum of costs
-            (paper) or the largest one ahead. Defaults to ``"sum"``.
-        risk (callable, optional): what :math:`Q_c(s, \tilde a)` is of the members' values ``[n, *B, K]``.
-            Defaults to :class:`~saferl.modules.Largest` (paper).
-        rescale (bool, optional): divide the actor's loss by :math:`1 + \lambda`. Defaults to ``False`` (paper).
+        cost_limit (float, optional): d, a bound on the discounted cost value, in the unit of the cost. Defaults to
+            ``0.05``.
+        cost_target ("max" or "mean", optional): what :math:`Q_c^-` is of the members of the target. Defaults to
+            ``"max"`` (paper), whose overestimate feeds itself.
+        cost_backup ("sum" or "reach", optional): what the cost critics learn, the discounted sum of costs (paper) or
+            the largest one ahead. Defaults to ``"sum"``.
+        risk (callable, optional): what :math:`Q_c(s, \tilde a)` is of the members' values ``[n, *B, K]``. Defaults to
+            :class:`~saferl.modules.Largest` (paper).
+        rescale (bool, optional): divide the actor's term by :math:`1 + \lambda`. Defaults to ``False`` (paper).
+        alpha_weight ("alpha" or "log_alpha", optional): what weighs the temperature's term. ``"alpha"`` is E14.
+            ``"log_alpha"`` is :class:`~torchrl.objectives.SACLoss`, whose slope in :math:`\log\alpha` lacks the factor
+            :math:`\alpha`. Defaults to ``"alpha"`` (paper).
         num_qvalue_nets (int, optional): reward critics. Defaults to ``2``, or the length of a list.
         num_cost_critics (int, optional): cost critics. Defaults to ``2``, or the length of a list.
-        delay_qvalue (bool, optional): keep target copies of both kinds of
-            critic. Defaults to ``True``.
-        alpha_init, min_alpha, max_alpha, action_spec, fixed_alpha,
-            target_entropy, separate_losses, reduction, deactivate_vmap,
-            use_prioritized_weights, scalar_output_mode: as in
-            :class:`~torchrl.objectives.SACLoss`.
+        delay_qvalue (bool, optional): keep target copies of both kinds of critic. Defaults to ``True``.
+        alpha_init, min_alpha, max_alpha, action_spec, fixed_alpha, target_entropy, separate_losses, reduction,
+            deactivate_vmap, use_prioritized_weights, scalar_output_mode: as in :class:`~torchrl.objectives.SACLoss`.
 
-    Reads (any batch shape ``[*B]``):
-        the networks' inputs at the root and under ``"next"``; ``"action"``
-        ``[*B, A]``; under ``"next"``: ``"reward"``, ``"cost"``, ``"done"``,
-        ``"terminated"`` ``[*B, 1]``. Where terminated, the next observation is
-        never used and may be NaN.
-
-    Writes:
-        ``"loss_actor"``, ``"loss_qvalue"``, ``"loss_cost"``, ``"loss_alpha"``,
-        ``"constraint_violation"`` (``[*B]`` without reduction, else scalars);
-        scalars ``"alpha"``, ``"entropy"``, ``"lagrange_multiplier"``. Into its
-        input: ``"td_error"`` ``[*B]``, the reward critics' priority.
+    Reads the networks' inputs at the root and under ``"next"``; ``"action"`` ``[*B, A]``; under ``"next"`` ``"reward"``
+        and ``"cost"`` ``[*B, 1]`` in their units, ``"done"`` and ``"terminated"`` ``[*B, 1]``. Where terminated, the
+        next observation is not used and may be NaN.
+    Writes ``"loss_actor"``, ``"loss_qvalue"``, ``"loss_cost"``, ``"loss_alpha"`` and ``"constraint_violation"``, in the
+        unit of the cost: scalars, or ``[*B]`` without reduction; the scalars ``"alpha"``, ``"entropy"`` (nats),
+        ``"lagrange_multiplier"`` (reward per cost). Into the batch: ``"td_error"`` ``[*B]`` of the reward critics.
 
     Raises:
-        ValueError: ``cost_limit`` is negative or not finite, a number of critics is
-            below one, critics come as a list of one, ``cost_target`` or ``cost_backup`` is
-            unknown, ``risk`` is no function, ``lagrange`` no multiplier, or ``gamma`` lies
-            outside [0, 1]; in a batch, ``cost_backup="reach"`` with multi-step transitions.
+        ValueError: ``cost_limit`` is negative or not finite; a number of critics is below one; critics come as a list
+            of one; ``cost_target``, ``cost_backup`` or ``alpha_weight`` is unknown; ``risk`` is no function;
+            ``lagrange`` is no multiplier; ``gamma`` lies outside [0, 1]; a batch has multi-step transitions with
+            ``cost_backup="reach"``.
         KeyError: the batch holds no cost.
 
     Examples:
@@ -136,20 +132,17 @@ class SACLagLoss(CostCriticLoss, SACLoss):
 
     @dataclass
     class _AcceptedKeys(SACLoss._AcceptedKeys):
-        """Keys that ``set_keys`` accepts beside those of SACLoss.
+        """Keys that ``set_keys`` accepts beside those of :class:`~torchrl.objectives.SACLoss`.
 
         Attributes:
-            cost (NestedKey): the cost under ``"next"``. Defaults to ``"cost"``.
-            state_action_cost_value (NestedKey): the entry that the cost critic
-                writes. Defaults to ``"state_action_cost_value"``.
+            cost: the cost under ``"next"``.
+            state_action_cost_value: what the cost critics write.
         """
 
         cost: NestedKey = "cost"
         state_action_cost_value: NestedKey = "state_action_cost_value"
 
     default_keys = _AcceptedKeys
-
-    log_alpha: Tensor
 
     def __init__(
         self,
@@ -159,10 +152,11 @@ class SACLagLoss(CostCriticLoss, SACLoss):
         *,
         lagrange: LagrangeMultiplier,
         cost_limit: float = 0.05,
-        cost_target: Literal["max", "mean"] = "max",
-        cost_backup: Literal["sum", "reach"] = "sum",
+        cost_target: CostTarget = "max",
+        cost_backup: CostBackup = "sum",
         risk: Callable[[Tensor], Tensor] | None = None,
         rescale: bool = False,
+        alpha_weight: AlphaWeight = "alpha",
         num_qvalue_nets: int | None = None,
         num_cost_critics: int | None = None,
         alpha_init: float = 1.0,
@@ -198,7 +192,7 @@ class SACLagLoss(CostCriticLoss, SACLoss):
             use_prioritized_weights=use_prioritized_weights,
             scalar_output_mode=scalar_output_mode,
         )
-        self._add_cost_critic(
+        self.add_cost_critic(
             cost_critic,
             num_cost_critics,
             lagrange=lagrange,
@@ -210,122 +204,91 @@ class SACLagLoss(CostCriticLoss, SACLoss):
             compare_against=list(actor_network.parameters()) if separate_losses else None,
         )
         self.rescale = rescale
+        self.alpha_weight = check_choice("alpha_weight", alpha_weight, AlphaWeight)
         _ = self.target_entropy  # now, as its first look-up would break a compiled graph
-        self.out_keys = [*_LOSSES, "constraint_violation"]
+        self.out_keys = ["loss_actor", "loss_qvalue", "loss_cost", "loss_alpha"]
+        self.out_keys += ["constraint_violation"]
         if self.reduction != "none" or self.scalar_output_mode == "non_tensor":
-            self.out_keys += _SCALARS
+            self.out_keys += ["alpha", "entropy", "lagrange_multiplier"]
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        next_sample = self._sample_next(tensordict)
-        # One look at the states serves the values of the stored action and of the policy's.
-        reward = self._bind(self.qvalue_network, self.qvalue_network_params, tensordict)
-        cost = self._bind(self.cost_critic, self.cost_critic_params, tensordict)
-        loss_qvalue, metadata = self.qvalue_v2_loss(tensordict, next_sample, reward)
-        loss_cost, _ = self.cost_loss(tensordict, next_sample, cost)
-        loss_actor, actor_metadata = self.actor_loss(tensordict, reward, cost)
-        log_prob = actor_metadata["log_prob"]
-        loss_alpha = self._reduce_loss(
-            self._alpha_loss(log_prob),
-            tensordict=tensordict,
-            weights=self._maybe_get_priority_weight(tensordict),
+        # One action at the next states serves both targets, and one look at the states all values in them.
+        shared = self._shared = SharedTerms(
+            tensordict,
+            self.sample_next(tensordict),
+            {name: self.critics(name, tensordict) for name in ("qvalue_network", "cost_critic")},
         )
-        tensordict.set(self.tensor_keys.priority, metadata["td_error"])
-        out = {
-            "loss_actor": loss_actor,
-            "loss_qvalue": loss_qvalue,
-            "loss_cost": loss_cost,
-            "loss_alpha": loss_alpha,
-            "constraint_violation": actor_metadata["constraint_violation"],
-        }
-        scalars = {
-            "alpha": self._alpha,
-            "entropy": -log_prob.mean(),
-            # A copy: the loop moves the buffer in place after this.
-            "lagrange_multiplier": self.lagrange.value.detach().clone(),
-        }
-        if self.reduction == "none":
-            td_out = TensorDict(out, batch_size=tensordict.batch_size)
-            if self.scalar_output_mode == "non_tensor":
-                for key, value in scalars.items():
-                    td_out.set_non_tensor(key, value)
-        else:
-            td_out = TensorDict({**out, **scalars}, batch_size=[])
-        self._clear_weakrefs(tensordict, td_out, *_PARAMS)
-        return td_out
+        try:
+            out = super().forward(tensordict)
+            out.set("loss_cost", self.cost_loss(tensordict)[0])
+            out.set("constraint_violation", shared.violation)
+        finally:
+            self._shared = None
+        # A copy: the loop moves the buffer in place after this.
+        multiplier = self.lagrange.value.detach().clone()
+        if self.reduction != "none":
+            out.set("lagrange_multiplier", multiplier)
+        elif self.scalar_output_mode == "non_tensor":
+            out.set_non_tensor("lagrange_multiplier", multiplier)
+        self.release(tensordict, out, "cost_critic_params", "target_cost_critic_params")
+        return out
 
-    def actor_loss(
-        self,
-        tensordict: TensorDictBase,
-        reward_critics: BoundCritics | None = None,
-        cost_critics: BoundCritics | None = None,
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """E11: entropy, smallest reward value and penalised largest cost value.
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """E11: the entropy's term, the smallest reward value and the penalised risk; critics get no gradient.
 
         Args:
-            tensordict (TensorDictBase): the batch.
-            reward_critics, cost_critics (optional): the critics bound to the batch's
-                states, where they are known already; their parameters get no gradient.
-        """
-        reward = reward_critics or self._bind(
-            self.qvalue_network, self.qvalue_network_params, tensordict
-        )
-        cost = cost_critics or self._bind(self.cost_critic, self.cost_critic_params, tensordict)
-        weights = self._maybe_get_priority_weight(tensordict)
-        sample, log_prob = self._sample_action(tensordict)
-        action = sample.get(self.tensor_keys.action)
-        qvalue = reward.detach().values(action).min(0)[0]
-        cost_value = replace(cost.detach(), reduce=self.risk)(action)
-        penalty = self.lagrange.penalty(cost_value.squeeze(-1) - self.cost_limit)
-        multiplier = self.lagrange.value.detach().to(penalty)
-        loss_actor = self._alpha * log_prob - qvalue.squeeze(-1) + multiplier * penalty
-        if self.rescale:
-            loss_actor = loss_actor / (1.0 + multiplier)
-        metadata = {
-            "log_prob": log_prob.detach(),
-            "constraint_violation": self._reduce_loss(
-                penalty.detach(),
-                tensordict=tensordict,
-                # The multiplier's step must not grow with the batch, even under "sum".
-                reduction="none" if self.reduction == "none" else "mean",
-                weights=weights,
-            ),
-        }
-        loss_actor = self._reduce_loss(loss_actor, tensordict=tensordict, weights=weights)
-        return loss_actor, metadata
+            tensordict: the batch ``[*B]``.
 
-    def qvalue_v2_loss(
-        self,
-        tensordict: TensorDictBase,
-        next_sample: tuple[TensorDictBase, Tensor] | None = None,
-        critics: BoundCritics | None = None,
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+        Returns:
+            The loss, reduced; ``"log_prob"`` ``[*B]`` and ``"constraint_violation"``, reduced, but never by a sum.
+        """
+        reward = self.critics("qvalue_network", tensordict).detach()
+        cost = replace(self.critics("cost_critic", tensordict).detach(), reduce=self.risk)
+        sample, log_prob = self.sample_action(tensordict)
+        action = sample.get(self.tensor_keys.action)
+        qvalue = reward.values(action).min(0)[0]
+        penalty = self.lagrange.penalty(cost(action).squeeze(-1) - self.cost_limit)
+        multiplier = self.lagrange.value.detach().to(penalty)
+        loss = self.temperature * log_prob - qvalue.squeeze(-1) + multiplier * penalty
+        if self.rescale:
+            loss = loss / (1.0 + multiplier)
+        # The multiplier's step must not grow with the batch, even under "sum".
+        kept = "none" if self.reduction == "none" else "mean"
+        violation = self.reduced(penalty.detach(), tensordict, kept)
+        if (shared := self.shared(tensordict)) is not None:
+            shared.violation = violation
+        metadata = {"log_prob": log_prob.detach(), "constraint_violation": violation}
+        return self.reduced(loss, tensordict), metadata
+
+    def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """E12: reward critics against the smallest soft target value.
 
         Args:
-            tensordict (TensorDictBase): the batch.
-            next_sample (optional): next state with the policy's action, and its
-                log-probability ``[*B]``. Drawn afresh by default.
-            critics (optional): the reward critics bound to the batch's states, where
-                they are known already.
-        """
-        next_state, log_prob = next_sample or self._sample_next(tensordict)
-        with torch.no_grad():
-            targets = self._bind(self.qvalue_network, self.target_qvalue_network_params, next_state)
-            next_value = targets.values(next_state.get(self.tensor_keys.action)).min(0)[0]
-            next_value = next_value - self._alpha * log_prob.unsqueeze(-1)
-            target = self.value_estimator.value_estimate(tensordict.copy(), next_value=next_value)
-        critics = critics or self._bind(self.qvalue_network, self.qvalue_network_params, tensordict)
-        predicted = critics.values(tensordict.get(self.tensor_keys.action))
-        return self._bellman_loss(predicted, target, tensordict)
+            tensordict: the batch ``[*B]``.
 
-    def _alpha_loss(self, log_prob: Tensor) -> Tensor:
-        """E14, unreduced ``[*B]``; the parent class weighs with ``log_alpha`` instead."""
+        Returns:
+            The loss, reduced, and ``"td_error"`` ``[*B]``, the largest over the members.
+        """
+        next_state, log_prob = self.next_sample(tensordict)
+        with torch.no_grad():
+            targets = self.bind(self.qvalue_network, self.target_qvalue_network_params, next_state)
+            next_value = targets.values(next_state.get(self.tensor_keys.action)).min(0)[0]
+            next_value = next_value - self.temperature * log_prob.unsqueeze(-1)
+            target = self.value_estimator.value_estimate(tensordict.copy(), next_value=next_value)
+        critics = self.critics("qvalue_network", tensordict)
+        predicted = critics.values(tensordict.get(self.tensor_keys.action))
+        return self.bellman_loss(predicted, target, tensordict)
+
+    def temperature_term(self, log_prob: Tensor) -> Tensor:
+        """E14, ``[*B]``, from log-probabilities ``[*B]``; with ``alpha_weight="log_alpha"`` SACLoss's."""
+        if self.alpha_weight == "log_alpha":
+            return super().temperature_term(log_prob)
         target = self.target_entropy  # a tensor, since the constructor asked for it
         return -self.log_alpha.exp() * (log_prob + target)  # pyright: ignore[reportOperatorIssue]
 
-    def _sample_action(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
-        """Copy of ``tensordict`` with an action of the policy, and its log-probability."""
+    def sample_action(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
+        """Copy of a batch with an action of the policy ``[*B, A]``, and its log-probability ``[*B]``."""
         tensordict = tensordict.copy()
         with (
             set_exploration_type(ExplorationType.RANDOM),
@@ -336,14 +299,14 @@ class SACLagLoss(CostCriticLoss, SACLoss):
             action, log_prob = compute_rsample_log_prob(dist)
         return tensordict.set(self.tensor_keys.action, action), log_prob
 
-    def _sample_next(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
+    def sample_next(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
         """Next state with one action of the policy, for the targets of reward and cost."""
         terminated = tensordict.get(("next", self.tensor_keys.terminated))
         next_state = tensordict.get("next").copy()
-        for key in self._observation_keys:
+        for key in self.observation_keys:
             # Multiplying by (1 - terminated) keeps a NaN, so a state that is never
             # valued gives way to a finite one before it meets a network.
             mask = expand_as_right(terminated.squeeze(-1), next_state[key])
             next_state.set(key, torch.where(mask, tensordict[key], next_state[key]))
         with torch.no_grad():
-            return self._sample_action(next_state)
+            return self.sample_action(next_state)

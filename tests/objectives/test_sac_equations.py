@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
+from torchrl.objectives import SACLoss
 
 from saferl.modules import DualAscent
 
@@ -206,7 +207,8 @@ def test_reward_target_takes_the_smaller_value_and_the_entropy(constant_loss, en
     batch = transition(terminated, truncated)
     next_state = batch["next"].clone().set("action", torch.zeros(1, 2))
     target = 0.25 if terminated else 0.25 + 0.8 * (5.0 - 0.5 * 1.5)
-    value, _ = constant_loss.qvalue_v2_loss(batch, (next_state, torch.tensor([1.5])))
+    constant_loss.sample_next = lambda _: (next_state, torch.tensor([1.5]))
+    value, _ = constant_loss.qvalue_v2_loss(batch)
     torch.testing.assert_close(value, half_squares(target, 1.0, 2.0))
 
 
@@ -216,6 +218,25 @@ def test_actor_term_penalises_the_larger_cost_value(constant_loss):
     expected = 0.5 * metadata["log_prob"][0] - 1.0 + 2.0 * 0.1
     torch.testing.assert_close(value, expected)
     torch.testing.assert_close(metadata["constraint_violation"], torch.tensor(0.1))
+
+
+def test_the_temperatures_term_is_the_papers_or_torchrls(make_loss, make_batch):
+    """alpha or log(alpha) weighs the same distance, so that the slopes in log(alpha) differ by the factor alpha."""
+    weights, slopes = [], []
+    for weight in ("alpha", "log_alpha"):
+        loss = make_loss(alpha_init=ALPHA, alpha_weight=weight)
+        torch.manual_seed(3)
+        term = loss(make_batch())["loss_alpha"]
+        term.backward()
+        weights.append(term.item())
+        slopes.append(loss.log_alpha.grad.item())
+    assert weights[0] * math.log(ALPHA) == pytest.approx(weights[1] * ALPHA)
+    assert slopes[0] == pytest.approx(ALPHA * slopes[1]) and slopes[0] != 0
+    log_prob = torch.randn(8)
+    theirs = SACLoss._alpha_loss(loss, log_prob)
+    torch.testing.assert_close(loss.alpha_loss(log_prob), theirs)
+    with pytest.raises(ValueError, match="alpha_weight must be one of alpha, log_alpha, got 'b'"):
+        make_loss(alpha_weight="b")
 
 
 class CostOfState(nn.Module):
