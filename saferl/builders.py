@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -9,7 +10,7 @@ from typing import Any, get_type_hints
 import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
@@ -138,10 +139,24 @@ def build_learner(cfg: DictConfig, loss: LossModule) -> Learner:
         SoftUpdate(loss, tau=cfg.tau) if _has_targets(loss) else None,
         order=cfg.update_order,
         compile=cfg.compile,
+        before_updates=_before_updates(loss) if on_policy(cfg) else (),
     )
 
 
-def build_experience(cfg: DictConfig, agent: Agent, scenario: Any) -> Replay | Epochs:
+def _before_updates(loss: Any) -> list[Callable[[TensorDictBase], Any]]:
+    """What an on-policy loss does with a whole batch: its advantages, and the step of its policy if it has one."""
+    # TorchRL's own losses leave their advantages to their estimator.
+    begin = getattr(loss, "begin", None) or partial(
+        loss.value_estimator,
+        params=loss.critic_network_params.detach(),
+        target_params=loss.target_critic_network_params,
+    )
+    return [begin, loss.policy_step().step] if hasattr(loss, "policy_step") else [begin]
+
+
+def build_experience(
+    cfg: DictConfig, agent: Agent, scenario: Any, learner: Learner
+) -> Replay | Epochs:
     """What the learner updates from: a replay buffer, or each batch of fresh transitions.
 
     Raises:
@@ -168,19 +183,12 @@ def build_experience(cfg: DictConfig, agent: Agent, scenario: Any) -> Replay | E
     generator = torch.Generator(device).manual_seed(cfg.seed)
     keys = (*observed(cfg), *(("next", key) for key in observed(cfg)))
     if fresh:
-        loss: Any = agent.loss
         frames = cfg.collector.frames_per_env * cfg.env.num_envs
         if cfg.batch_size > frames:
             raise ValueError(
                 f"batch_size must be <= {frames}, the frames of a batch from one policy (collector=rollout, "
                 f"rollout_frames), got {cfg.batch_size}."
             )
-        # TorchRL's own losses leave their advantages to their estimator.
-        begin = getattr(loss, "begin", None) or partial(
-            loss.value_estimator,
-            params=loss.critic_network_params.detach(),
-            target_params=loss.target_critic_network_params,
-        )
         buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(frames, device=device),
             # Without the rest of an epoch: a small batch would weigh as much as a whole one.
@@ -190,7 +198,11 @@ def build_experience(cfg: DictConfig, agent: Agent, scenario: Any) -> Replay | E
         )
         stored = (*keys, *STORED, *ADVANTAGES)
         return make(
-            cfg.experience, buffer=buffer, stored=stored, begin=begin, reward_scale=cfg.reward_scale
+            cfg.experience,
+            buffer=buffer,
+            stored=stored,
+            begin=learner.begin,
+            reward_scale=cfg.reward_scale,
         )
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(cfg.buffer_size, device=device),
@@ -264,11 +276,12 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         track_traj_ids=False,
         auto_register_policy_transforms=False,
     )
+    learner = build_learner(cfg, agent.loss)
     trainer = Trainer(
         run=run,
         collector=collector,
-        experience=build_experience(cfg, agent, scenario),
-        learner=build_learner(cfg, agent.loss),
+        experience=build_experience(cfg, agent, scenario, learner),
+        learner=learner,
         budget=budget,
         record_every=cfg.record_every,
         save_every=cfg.save_every,

@@ -11,31 +11,14 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torch.distributions import Distribution, Independent, TransformedDistribution, kl_divergence
+from torch.distributions import Distribution, kl_divergence
 from torchrl.objectives import PPOLoss
 
 from saferl.objectives.advantages import CostValueKeys, CostValueMixin
 from saferl.objectives.checks import check_begun, check_limit
 from saferl.objectives.episodes import EpisodeCost
-from saferl.objectives.trust_region import (
-    CASES,
-    conjugate_gradient,
-    constrained_direction,
-    flat,
-)
-
-
-def policy_kl(old: Distribution, new: Distribution) -> Tensor:
-    """KL(old || new) of two policies [*B], summed over the dimensions of an action.
-
-    A squashed Gaussian's is that of the Gaussians, as the same invertible map squashes both.
-    """
-    if isinstance(old, TransformedDistribution) and isinstance(new, TransformedDistribution):
-        return policy_kl(old.base_dist, new.base_dist)
-    if isinstance(old, Independent) and isinstance(new, Independent):
-        inner = kl_divergence(old.base_dist, new.base_dist)
-        return inner.flatten(inner.ndim - old.reinterpreted_batch_ndims).sum(-1)
-    return kl_divergence(old, new)
+from saferl.objectives.policy_step import TrustRegionStep
+from saferl.objectives.trust_region import CASES
 
 
 @dataclass
@@ -50,35 +33,26 @@ class CPOKeys(CostValueKeys):
 
 
 class CPOLoss(CostValueMixin, PPOLoss):
-    r"""A policy's trust-region step under a cost constraint, and the losses of its two value networks.
-
-    For a batch of fresh transitions :meth:`begin` estimates the advantages and then moves the policy:
+    r"""The value losses of CPO, and the terms of the step that moves its policy (Achiam et al., 2017).
 
     .. math::
 
-        \max_x\; g^T x \quad \text{such that} \quad c + b^T x \le 0, \quad
+        L_V &= E[(V(s) - G)^2], \quad L_c = E[\tfrac12 (V_c(s) - G_c)^2] \\
+        \max_x\; & g^T x \quad \text{such that} \quad (J_c - d) / w + b^T x \le 0, \quad
         \tfrac12 x^T H x \le \delta
 
-    with g and b the gradients of the mean of ratio times advantage, of reward and cost, H the Fisher matrix of
-    the policy, and :math:`c = (J_c - d) / w` the violation *per decision*: g and b are means over decisions,
-    and :math:`J_c(\pi') - J_c(\pi)` is to first order :math:`w = E[\sum_{t<L} \gamma^t]` times such a mean, L the
-    length of an episode. :math:`J_c = E[\sum_{t<L} \gamma^t c_t]` is the discounted cost of an episode from its
-    start to its end, by termination or truncation; both are means over the episodes that ended lately
-    (:meth:`cost_of_policy`).
-
-    The step is shortened by ``backtrack`` until the KL is within delta, the surrogate does not get worse (not
-    asked where the step must first regain feasibility), and the cost's surrogate does not rise above its limit
-    (above where it was, from an infeasible start); if none of ``search_steps`` will do, the policy stays where it was.
-
-    :meth:`forward` gives the losses of the value networks, for mini-batches, and reports the last step.
+    with :math:`G` and :math:`G_c` the value targets, TD(lambda). The first line is :meth:`forward`, for mini-batches. The
+    second is :class:`~saferl.objectives.TrustRegionStep`, once for each whole batch, after :meth:`begin`:
+    ``loss.policy_step().step(data)``. The loss has what it needs: :meth:`policy`, :meth:`surrogates` (whose gradients
+    are g and b), :meth:`cost_of_policy` (:math:`J_c` and :math:`w`) and the settings.
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): the policy.
-        critic_network (TensorDictModule): V(s); writes ``"state_value"``.
-        cost_critic (TensorDictModule): V_c(s); writes ``"state_cost_value"``.
+        critic_network (TensorDictModule): V(s).
+        cost_critic (TensorDictModule): V_c(s).
 
     Keyword Args:
-        cost_limit (float, optional): d, bound on the discounted cost of an episode. Defaults to ``0.05``.
+        cost_limit (float, optional): d, a bound on the discounted cost of an episode, in its unit. Defaults to ``0.05``.
         trust (float, optional): delta, on the mean KL. Defaults to ``0.01``.
         cg_steps (int, optional): conjugate-gradient iterations. Defaults to ``15``.
         damping (float, optional): added to H's diagonal. Defaults to ``0.1``.
@@ -87,15 +61,17 @@ class CPOLoss(CostValueMixin, PPOLoss):
         critic_coeff, loss_critic_type, separate_losses, reduction: as in
             :class:`~torchrl.objectives.PPOLoss`. Default here: ``loss_critic_type="l2"``.
 
-    Reads: :meth:`begin` a whole batch ``[*B, T]`` with the policy's ``"action"`` and its log-probability, under
-        ``"next"`` ``"reward"``, ``"cost"``, ``"done"``, ``"terminated"``, and ``"is_init"``
-        (``torchrl.envs.InitTracker``); :meth:`forward` any part of it.
-    Writes ``"loss_critic"``, ``"loss_cost"``; reports ``"kl"``, ``"cost_estimate"`` (J_c),
-        ``"step_fraction"`` (0: the policy stayed), and the share of each case, ``"cpo_feasible"`` and so on.
+    Reads what :meth:`begin` leaves in a batch, in any batch shape ``[*B]``: the value networks' inputs;
+        ``"value_target"`` in the unit of the reward and ``"cost_value_target"`` in the unit of the cost, ``[*B, 1]``.
+        :meth:`begin` reads besides ``"is_init"`` ``[*B, T, 1]`` (of ``torchrl.envs.InitTracker``).
+    Writes ``"loss_critic"``, ``"loss_cost"``: scalars, or ``[*B]`` without reduction; ``"explained_variance"``. Reports of
+        the last step, scalars: ``"kl"`` (nats), ``"cost_estimate"`` (:math:`J_c`, in the unit of the cost),
+        ``"step_fraction"`` (0: the policy stayed), and 1 for its case of ``"cpo_unconstrained"``, ``"cpo_feasible"``,
+        ``"cpo_recoverable"``, ``"cpo_infeasible"``.
 
     Raises:
-        ValueError: a setting is out of range, or ``gamma`` lies outside [0, 1].
-        KeyError: the batch holds no cost or no ``is_init``.
+        ValueError: a setting is out of range; ``gamma`` lies outside [0, 1].
+        KeyError: the batch holds no cost or no ``is_init``; ``begin`` has not seen it.
 
     Examples:
         >>> import torch
@@ -120,6 +96,7 @@ class CPOLoss(CostValueMixin, PPOLoss):
         ... )
         >>> batch = actor(batch).detach()
         >>> loss.begin(batch)
+        >>> loss.policy_step().step(batch)
         >>> output = loss(batch.reshape(-1))
         >>> bool(output["kl"] <= loss.trust)
         True
@@ -174,19 +151,18 @@ class CPOLoss(CostValueMixin, PPOLoss):
         self.out_keys += ["step_fraction", *(f"cpo_{name}" for name in CASES)]
         self.trust, self.cg_steps, self.damping = trust, cg_steps, damping
         self.search_steps, self.backtrack = search_steps, backtrack
-        # Of the last step: KL, J_c, fraction of the step, number of the case.
+        # Of the last step, which writes it: KL, J_c, fraction of the step, number of the case.
         self.register_buffer("report", torch.full((4,), torch.nan, device=device))
         self.episodes = EpisodeCost().to(device)
 
-    @torch.no_grad()
     def begin(self, tensordict: TensorDictBase) -> None:
-        """Write the advantages of a batch of fresh transitions, and move the policy by one step.
+        """As :meth:`CostValueMixin.begin`; says besides what the step will miss.
 
         Args:
-            tensordict: ``[*B, T]``; gets what :meth:`CostValueMixin.begin` writes.
+            tensordict: ``[*B, T]``.
 
         Raises:
-            KeyError: no cost, or no ``is_init``.
+            KeyError: the batch holds no cost, or no ``is_init``.
         """
         super().begin(tensordict)
         if tensordict.get(self.tensor_keys.is_init, None) is None:
@@ -194,9 +170,10 @@ class CPOLoss(CostValueMixin, PPOLoss):
                 f"The batch has no entry {self.tensor_keys.is_init!r}, which tells where episodes begin. "
                 "Append torchrl.envs.InitTracker() to the environment."
             )
-        cost, weight = self.cost_of_policy(tensordict)
-        self._step(tensordict.reshape(-1), (cost - self.cost_limit) / weight)
-        self.report[1] = cost
+
+    def policy_step(self) -> TrustRegionStep:
+        """What moves the policy: an object whose ``step`` takes a whole batch, after :meth:`begin`."""
+        return TrustRegionStep(self)
 
     @torch.no_grad()
     def cost_of_policy(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
@@ -230,13 +207,28 @@ class CPOLoss(CostValueMixin, PPOLoss):
         total, weight = so_far + discount * ahead, weight + discount * left
         return total.mean().to(cost), weight.mean().to(cost)
 
-    def _surrogates(
-        self, batch: TensorDictBase, old: Distribution
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Means over a batch: ratio times the reward's advantage, times the cost's, and the KL from ``old``."""
+    def policy(self, batch: TensorDictBase) -> Distribution:
+        """The distribution of actions ``[*B, A]`` in the states of a batch ``[*B]``."""
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            new = self.actor_network.get_dist(batch.select(*self.actor_network.in_keys))
-        action = batch.get(self.tensor_keys.action)
+            return self.actor_network.get_dist(batch.select(*self.actor_network.in_keys))
+
+    def surrogates(self, batch: TensorDictBase, old: Distribution) -> tuple[Tensor, Tensor, Tensor]:
+        r"""Means over a batch, with the policy as it is now.
+
+        .. math::
+
+            E[\rho (A_r - \bar A_r)], \quad E[\rho (A_c - \bar A_c)], \quad E[\mathrm{KL}(\pi_{old} \| \pi)]
+
+        with :math:`\rho` the ratio of its probability to that of ``old``.
+
+        Args:
+            batch: ``[*B]``.
+            old: the policy in its states, a constant.
+
+        Returns:
+            Three scalars, in the units of reward and cost, and in nats.
+        """
+        new, action = self.policy(batch), batch.get(self.tensor_keys.action)
         ratio = (new.log_prob(action) - old.log_prob(action)).exp()
         reward, cost = (
             batch.get(key).squeeze(-1)
@@ -244,81 +236,7 @@ class CPOLoss(CostValueMixin, PPOLoss):
         )
         # Centred, which changes no gradient but their variance; never divided by one another's spread.
         reward, cost = reward - reward.mean(), cost - cost.mean()
-        return (ratio * reward).mean(), (ratio * cost).mean(), policy_kl(old, new).mean()
-
-    @torch.no_grad()
-    def _step(self, batch: TensorDictBase, violation: Tensor) -> None:
-        parameters = [p for p in self.actor_network_params.values(True, True) if p.requires_grad]
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            old = self.actor_network.get_dist(batch.select(*self.actor_network.in_keys))
-
-        def gradient_of(term: Tensor, create_graph: bool = False) -> Tensor:
-            # A parameter that the policy does not use has none.
-            return flat(
-                torch.autograd.grad(
-                    term,
-                    parameters,
-                    retain_graph=True,
-                    create_graph=create_graph,
-                    allow_unused=True,
-                    materialize_grads=True,
-                )
-            )
-
-        with torch.enable_grad():
-            reward, cost, kl = self._surrogates(batch, old)
-            gradient, cost_gradient = gradient_of(reward), gradient_of(cost)
-            kl_gradient = gradient_of(kl, create_graph=True)
-
-        def fisher(vector: Tensor) -> Tensor:
-            with torch.enable_grad():
-                return gradient_of(kl_gradient @ vector) + self.damping * vector
-
-        direction = constrained_direction(
-            gradient,
-            cost_gradient,
-            float(violation),
-            lambda vector: conjugate_gradient(fisher, vector, self.cg_steps),
-            self.trust,
-        )
-        self._search(batch, old, parameters, direction.step, direction.case, float(violation))
-
-    def _search(
-        self,
-        batch: TensorDictBase,
-        old: Distribution,
-        parameters: list[Tensor],
-        step: Tensor,
-        case: str,
-        violation: float,
-    ) -> None:
-        """Take the longest part of a step that keeps what it promises; none restores the policy."""
-        before = [parameter.detach().clone() for parameter in parameters]
-        sizes = [parameter.numel() for parameter in parameters]
-        parts = [
-            part.view_as(parameter)
-            for part, parameter in zip(step.split(sizes), parameters, strict=True)
-        ]
-        reward, cost, _ = self._surrogates(batch, old)
-        slack = max(-violation, 0.0)
-        fraction, kl = 1.0, torch.zeros(())
-        for _ in range(self.search_steps):
-            for parameter, start, part in zip(parameters, before, parts, strict=True):
-                parameter.data.copy_(start + fraction * part)
-            new_reward, new_cost, kl = self._surrogates(batch, old)
-            # Comparisons with a NaN are false, so that a step which is not finite is shortened too.
-            if (
-                kl <= self.trust
-                and (new_reward >= reward or case in ("recoverable", "infeasible"))
-                and new_cost - cost <= slack
-            ):
-                break
-            fraction *= self.backtrack
-        else:
-            fraction, kl = 0.0, torch.zeros(())
-            for parameter, start in zip(parameters, before, strict=True):
-                parameter.data.copy_(start)
-        self.report.copy_(torch.tensor([float(kl), torch.nan, fraction, float(CASES.index(case))]))
+        return (ratio * reward).mean(), (ratio * cost).mean(), kl_divergence(old, new).mean()
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

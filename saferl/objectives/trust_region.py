@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
 #: What a step did, in the order of their numbers in the records.
-CASES = ("unconstrained", "feasible", "recoverable", "infeasible")
+Case = Literal["unconstrained", "feasible", "recoverable", "infeasible"]
+CASES: tuple[Case, ...] = get_args(Case)
 
 
 def flat(tensors: Iterable[Tensor]) -> Tensor:
@@ -59,7 +61,7 @@ class Direction:
     """
 
     step: Tensor
-    case: str
+    case: Case
     reward_multiplier: float
     cost_multiplier: float
 

@@ -13,9 +13,9 @@ from torchrl.modules import TanhNormal
 from torchrl.objectives import ValueEstimators
 
 from saferl.modules import tanh_gaussian_actor
-from saferl.objectives import CPOLoss
-from saferl.objectives.cpo import policy_kl
-from saferl.objectives.trust_region import CASES, constrained_direction, flat
+from saferl.objectives import CPOLoss, TrustRegionStep
+from saferl.objectives.policy_step import assign
+from saferl.objectives.trust_region import CASES, Direction, constrained_direction, flat
 
 
 def drive(data: TensorDict, over: torch.Tensor, previous: torch.Tensor) -> None:
@@ -38,7 +38,7 @@ def test_cost_of_the_policy_is_that_of_whole_episodes(gamma: float):
         over = torch.rand(4, 7, generator=generator) < (0.0 if number in (0, 5) else 0.1)
         drive(data, over, previous)
         previous = over[:, -1]
-        super(CPOLoss, loss).begin(data)
+        loss.begin(data)
         cost, weight = loss.cost_of_policy(data)
         finished = []
         for row in range(4):
@@ -72,7 +72,7 @@ def test_an_episode_whose_start_was_not_seen_does_not_count():
     data, over = batch_of(actor), torch.zeros(4, 7, dtype=torch.bool)
     over[0, 2] = True
     drive(data, over, torch.tensor([False, True, True, True]))
-    super(CPOLoss, loss).begin(data)
+    loss.begin(data)
     loss.cost_of_policy(data)
     assert loss.episodes.count == 0  # the only end is of an episode that began before
     over = torch.zeros(4, 7, dtype=torch.bool)
@@ -92,13 +92,15 @@ def test_an_episode_whose_start_was_not_seen_does_not_count():
 def test_cost_of_long_episodes_is_not_a_guess_of_the_critic():
     """A cost of 1 in each of 500 decisions, in batches of 64: the limit is seen to be broken at once."""
     loss, actor = build("cpo", cost_limit=30.0)
+    step = loss.policy_step()
     loss.make_value_estimator(ValueEstimators.GAE, gamma=0.99, lmbda=0.95)
     for number in range(9):
         data = batch_of(actor, steps=64)
         data["next", "cost"].fill_(1.0)
-        step = torch.arange(64 * number, 64 * number + 64) % 500
-        drive(data, (step == 499).expand(4, 64), torch.full((4,), number == 0))
+        decision = torch.arange(64 * number, 64 * number + 64) % 500
+        drive(data, (decision == 499).expand(4, 64), torch.full((4,), number == 0))
         loss.begin(data)
+        step.step(data)
         out = loss(data.reshape(-1))
         assert out["cost_estimate"] > 40 and out["cpo_infeasible"] + out["cpo_recoverable"] == 1
     assert float(out["cost_estimate"]) == pytest.approx((1 - 0.99**500) / 0.01)
@@ -107,10 +109,11 @@ def test_cost_of_long_episodes_is_not_a_guess_of_the_critic():
 def test_the_violation_is_stated_per_decision():
     """(J_c - d) / w goes into the step (docs/pitfalls.md, 7)."""
     loss, actor = build("cpo", cost_limit=1.2)
-    given = []
-    loss._step = lambda batch, violation: given.append(float(violation))
+    step, given = loss.policy_step(), []
+    step.move = lambda batch, violation: given.append(violation) or (0.0, 0.0, "feasible")
     data = batch_of(actor)
     loss.begin(data)
+    step.step(data)
     costs = data["next", "cost"].squeeze(-1)
     ended = costs[0, :4].tolist(), costs[1, :3].tolist()
     mean = sum(sum(c * GAMMA**t for t, c in enumerate(each)) for each in ended) / 2
@@ -132,25 +135,31 @@ def test_the_violation_is_stated_per_decision():
         ("feasible", -0.1, lambda f: (math.nan if f > 0.5 else f, 0.0, 0.0), 0.5),
     ],
 )
-def test_the_search_takes_the_longest_step_that_keeps_every_promise(case, violation, step, taken):
+def test_the_search_takes_the_longest_step_that_keeps_every_promise(
+    case, violation, step, taken, monkeypatch
+):
     loss, _ = build("cpo", trust=0.01, backtrack=0.5)
-    parameters = [torch.zeros(1)]
-    loss._surrogates = lambda batch, old: (
-        tuple(map(torch.tensor, step(float(parameters[0]))))
-        if parameters[0]
+    parameter = torch.zeros(1)
+    monkeypatch.setattr(TrustRegionStep, "policy_parameters", [parameter])
+    loss.surrogates = lambda batch, old: (
+        tuple(map(torch.tensor, step(float(parameter))))
+        if parameter
         else (torch.tensor(0.0), torch.tensor(0.0), torch.tensor(0.0))
     )
-    loss._search(TensorDict(), None, parameters, torch.ones(1), case, violation)
-    assert float(parameters[0]) == taken == float(loss.report[2])
+    found = Direction(torch.ones(1), case, 1.0, 0.0)
+    kl, fraction = loss.policy_step().search(TensorDict(), None, found, violation)
+    assert float(parameter) == taken == fraction
+    assert kl == pytest.approx(step(taken)[2])
 
 
 def test_kl_of_squashed_policies():
-    """Equal to that of the Gaussians, summed over an action's dimensions, and to samples."""
+    """torch's is that of the Gaussians, summed over an action's dimensions, and of samples."""
     torch.manual_seed(0)
     loc, scale = torch.randn(2, 5, 2), torch.rand(2, 5, 2) + 0.5
-    old, new = (TanhNormal(loc[i], scale[i]) for i in range(2))
+    options = {"low": -1.0, "high": 1.0, "safe_tanh": True}  # as our policies have them
+    old, new = (TanhNormal(loc[i], scale[i], **options) for i in range(2))
     normal = [torch.distributions.Normal(loc[i], scale[i]) for i in range(2)]
-    ours = policy_kl(old, new)
+    ours = kl_divergence(old, new)
     torch.testing.assert_close(ours, kl_divergence(*normal).sum(-1))
     action = old.sample((40_000,))
     sampled = old.log_prob(action) - new.log_prob(action)
@@ -167,7 +176,7 @@ def test_a_step_keeps_what_it_promises(above: float):
     """With the limit far or little above or below what the policy costs."""
     loss, actor = build("cpo", trust=0.02, damping=0.01)
     data = batch_of(actor, envs=64)
-    super(CPOLoss, loss).begin(data)
+    loss.begin(data)
     limit = max(float(loss.cost_of_policy(data)[0]) + above, 0.0)
     loss, actor = build("cpo", cost_limit=limit, trust=0.02, damping=0.01)
     data = batch_of(actor, envs=64)
@@ -176,10 +185,12 @@ def test_a_step_keeps_what_it_promises(above: float):
     with loss.actor_network_params.to_module(loss.actor_network), torch.no_grad():
         old = loss.actor_network.get_dist(data_flat.select("observation"))
     loss.begin(data)
+    assert torch.equal(policy(loss), before)  # the step alone moves it
+    loss.policy_step().step(data)
     out = loss(data.reshape(-1))
     (case,) = (name for name in CASES if out[f"cpo_{name}"] == 1)
     with torch.no_grad():
-        reward, cost, kl = loss._surrogates(data.reshape(-1), old)
+        reward, cost, kl = loss.surrogates(data.reshape(-1), old)
     assert kl <= loss.trust and float(out["kl"]) == pytest.approx(float(kl), rel=1e-4)
     assert float(out["step_fraction"]) > 0 and not torch.equal(policy(loss), before)
     start = float(out["cost_estimate"])
@@ -197,12 +208,12 @@ def test_fisher_products_and_direction_match_dense_algebra(case: str, violation:
     """The step that is tried first is the closed-form solution of the quadratic problem (1e-5)."""
     loss, actor = build("cpo", damping=0.1, cg_steps=200)
     data = batch_of(actor, envs=16)
-    super(CPOLoss, loss).begin(data)
+    loss.begin(data)
     flat_data = data.reshape(-1)
     parameters = list(loss.actor_network_params.values(True, True))
     with loss.actor_network_params.to_module(loss.actor_network), torch.no_grad():
         old = loss.actor_network.get_dist(flat_data.select("observation"))
-    reward, price, kl = loss._surrogates(flat_data, old)
+    reward, price, kl = loss.surrogates(flat_data, old)
     g, b = (
         flat(torch.autograd.grad(term, parameters, retain_graph=True)) for term in (reward, price)
     )
@@ -210,12 +221,10 @@ def test_fisher_products_and_direction_match_dense_algebra(case: str, violation:
     rows = [flat(torch.autograd.grad(each, parameters, retain_graph=True)) for each in first]
     H = torch.stack(rows) + 0.1 * torch.eye(len(first), dtype=torch.float64)
 
-    tried = {}
-    loss._search = lambda batch, old, parameters, step, case, c: tried.update(step=step, case=case)
-    loss._step(flat_data, torch.tensor(violation))
-    x = tried["step"]
+    tried = loss.policy_step().direction(flat_data, old, violation)
+    x = tried.step
     dense = constrained_direction(g, b, violation, lambda v: torch.linalg.solve(H, v), loss.trust)
-    assert tried["case"] == dense.case == case
+    assert tried.case == dense.case == case
     assert (x - dense.step).norm() <= 1e-5 * dense.step.norm() > 0
     # Optimality of a convex problem, with multipliers fitted to the solution.
     assert 0.5 * x @ H @ x <= loss.trust * (1 + 1e-5)
@@ -235,15 +244,16 @@ def test_a_failed_search_restores_the_policy():
     loss, actor = build("cpo", cost_limit=100.0)
     data = batch_of(actor)
     before = policy(loss)
-    surrogates, calls = loss._surrogates, []
+    surrogates, calls = loss.surrogates, []
 
     def broken(batch, old):
         calls.append(None)
         values = surrogates(batch, old)
         return values if len(calls) <= 2 else tuple(value * math.nan for value in values)
 
-    loss._surrogates = broken
+    loss.surrogates = broken
     loss.begin(data)
+    loss.policy_step().step(data)
     assert torch.equal(policy(loss), before)
     out = loss(data.reshape(-1))
     assert out["step_fraction"] == 0 and out["kl"] == 0
@@ -273,7 +283,9 @@ def test_cpo_leaves_parameters_that_the_policy_does_not_use():
     actor.module[0].register_parameter("spare", spare)
     values = value("state_value").double(), value("state_cost_value").double()
     loss = CPOLoss(actor, *values, cost_limit=100.0)
-    loss.begin(batch_of(actor))
+    data = batch_of(actor)
+    loss.begin(data)
+    loss.policy_step().step(data)
     assert loss.report[2] > 0 and (spare == 1).all()
 
 
@@ -283,10 +295,12 @@ def test_cpo_needs_to_know_where_episodes_begin():
         loss.begin(batch_of(actor).exclude("is_init"))
 
 
-def test_keys_can_be_renamed():
-    loss, actor = build("cpo")
-    loss.set_keys(cost="price")
-    data = batch_of(actor)
-    data.rename_key_(("next", "cost"), ("next", "price"))
-    loss.begin(data)
-    assert loss(data.reshape(-1))["loss_cost"].isfinite()
+def test_parameters_are_written_where_they_lie():
+    """What holds their memory, a compiled graph or a view of them, sees the step."""
+    parameters = [torch.nn.Parameter(torch.zeros(2, 3)), torch.nn.Parameter(torch.zeros(()))]
+    places = [parameter.data_ptr() for parameter in parameters]
+    assign(parameters, torch.arange(7.0))
+    assert torch.equal(flat(parameters), torch.arange(7.0))
+    assert [parameter.data_ptr() for parameter in parameters] == places
+    # A tensor that lies transposed keeps its order, where a view of it would fail.
+    assert flat([torch.arange(6).reshape(2, 3).T]).tolist() == [0, 3, 1, 4, 2, 5]

@@ -14,7 +14,7 @@ from omnisafe_fixture import (
 )
 from torch import Tensor
 
-from saferl.objectives import cpo
+from saferl.objectives import policy_step
 from saferl.objectives.trust_region import conjugate_gradient, flat
 
 #: OmniSafe's number of a case -> our name.
@@ -47,24 +47,25 @@ class Trial:
         self.data = with_their_advantages(data, "cpo")
         self.data["cost_advantage"] *= sign
         self.parameters = named(self.loss.actor_network_params)
-        self.search, self.vector, self.product = self.loss._search, None, None
+        self.stepper = self.loss.policy_step()
+        self.search, self.vector, self.product = self.stepper.search, None, None
         # To the end, as OmniSafe's were for the fixture: by default ours stop at a residual of 1e-5.
-        monkeypatch.setattr(cpo, "conjugate_gradient", self.solve)
-        monkeypatch.setattr(self.loss, "_search", self.listen)
+        monkeypatch.setattr(policy_step, "conjugate_gradient", self.solve)
+        monkeypatch.setattr(self.stepper, "search", self.listen)
 
     def solve(self, product, target, steps):
         if self.vector is not None:  # now, as the search moves the parameters of the product
             self.product = product(self.vector)
         return conjugate_gradient(product, target, 200, tolerance=1e-24)
 
-    def listen(self, batch, old, parameters, step, case, violation):
-        assert all(a is b for a, b in zip(parameters, self.parameters.values(), strict=True))
-        self.direction, self.case = self.to_theirs(step), case
-        self.search(batch, old, parameters, step, case, violation)
+    def listen(self, batch, old, direction, violation):
+        moved = self.stepper.policy_parameters
+        assert all(a is b for a, b in zip(moved, self.parameters.values(), strict=True))
+        self.direction, self.case = self.to_theirs(direction.step), direction.case
+        return self.search(batch, old, direction, violation)
 
     def step(self, violation: float) -> None:
-        with torch.no_grad():
-            self.loss._step(self.data, torch.tensor(violation))
+        self.stepper.move(self.data, violation)
 
     def to_theirs(self, vector: Tensor) -> Tensor:
         sizes = [parameter.numel() for parameter in self.parameters.values()]
@@ -90,7 +91,7 @@ def test_cpo_surrogates_and_kl(monkeypatch):
     assert_agrees(old.log_prob(data["action"]), found["batch"]["logp"])
     for name, leaf in trial.parameters.items():
         leaf.data.copy_(torch.tensor(found["weights"]["actor_after"][name]))
-    reward, cost, kl = loss._surrogates(data, old)
+    reward, cost, kl = loss.surrogates(data, old)
     # A loss at OmniSafe, an objective at ours; its buffer has centred both advantages.
     theirs = found["surrogates"]
     assert_agrees(-reward, theirs["reward"]["loss"])

@@ -15,7 +15,6 @@ def test_advantages_match_a_loop(kind: str):
     """Through a truncation with the value behind it, not through a termination; an episode's cost ends with it."""
     loss, actor = build(kind)
     data = batch_of(actor)
-    # CPO moves the policy in the same call; the values that the advantages use do not move.
     loss.begin(data)
     for name, params, key, advantage, target in (
         ("critic_network", loss.critic_network_params, "reward", "advantage", "value_target"),
