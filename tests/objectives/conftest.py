@@ -8,6 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.data import Bounded
 from torchrl.modules import MLP, ProbabilisticActor, TanhNormal, ValueOperator
@@ -32,7 +33,11 @@ class GaussianHead(nn.Module):
         return loc, log_scale.exp()
 
 
-def actor(action: str = "action", observation: str = "observation") -> ProbabilisticActor:
+def actor(
+    action: NestedKey = "action",
+    observation: str = "observation",
+    log_prob: NestedKey | None = None,
+) -> ProbabilisticActor:
     return ProbabilisticActor(
         TensorDictModule(GaussianHead(), in_keys=[observation], out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
@@ -40,10 +45,13 @@ def actor(action: str = "action", observation: str = "observation") -> Probabili
         spec=Bounded(-1, 1, (ACT,)),
         distribution_class=TanhNormal,
         return_log_prob=True,
+        log_prob_key=log_prob,
     )
 
 
-def critic(out_key: str, action: str = "action", dropout: float | None = None) -> ValueOperator:
+def critic(
+    out_key: NestedKey, action: NestedKey = "action", dropout: float | None = None
+) -> ValueOperator:
     net = MLP(
         in_features=OBS + ACT,
         out_features=1,
