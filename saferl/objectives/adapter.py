@@ -1,4 +1,7 @@
-"""What TorchRL's losses keep under an underscore: saferl touches it here and nowhere else."""
+"""What TorchRL's losses keep under an underscore: saferl's touch it here and nowhere else.
+
+But for ``_AcceptedKeys``, which TorchRL asks every loss to define.
+"""
 
 from __future__ import annotations
 
