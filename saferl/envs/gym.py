@@ -82,7 +82,8 @@ class GymTask:
         """
         env = _Cost(self.make(), self.cost_key)
         limit = gymnasium.spec(self.id.rpartition(":")[2]).max_episode_steps
-        if self.horizon is None and limit is None:
+        horizon = limit if self.horizon is None else self.horizon
+        if horizon is None:
             raise ValueError(f"task.horizon must be given: {self.id} has no time limit of its own.")
         found = {
             "size": gymnasium.spaces.flatdim(env.observation_space),
@@ -95,7 +96,7 @@ class GymTask:
         for key, value in found.items():
             if getattr(self, key) not in (None, value):
                 raise ValueError(f"task.{key} is {value} in {self.id}, got {getattr(self, key)}.")
-        return {**found, "horizon": limit if self.horizon is None else self.horizon}
+        return {**found, "horizon": horizon}
 
 
 class GymEnvs(ReplayedEnv):
