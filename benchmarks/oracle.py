@@ -21,7 +21,7 @@ from torch import Tensor
 
 from saferl.envs.intersection import BatchedIntersection, Scenario
 from saferl.envs.intersection.drivers import Driver
-from saferl.envs.intersection.traffic import STOP
+from saferl.envs.intersection.yielding import STOP
 from saferl.envs.seeding import episode_seeds
 from saferl.evaluation import as_test, episode_rows, play
 

@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -26,48 +25,35 @@ from saferl.envs.intersection import SCENARIOS, BatchedIntersection, HighwayInte
 from saferl.envs.intersection.batched import vehicles_of
 from saferl.envs.intersection.cost import CollisionCost
 from saferl.envs.intersection.drivers import CautiousDriver, Driver
-from saferl.envs.intersection.geometry import LENGTH
-from saferl.envs.intersection.network import rectangles_overlap, routes
+from saferl.envs.intersection.geometry import LENGTH, separation
+from saferl.envs.intersection.roads import lane_frames, lanes
+from saferl.envs.intersection.traffic import Vehicles
 
 DRIVERS = {"blind": Driver(), "cautious": CautiousDriver(), "parked": None}
 
 
-class Traffic(NamedTuple):
-    """The surrounding vehicles of every episode, each [episodes, N]."""
-
-    present: np.ndarray
-    route: np.ndarray
-    s: np.ndarray
-    speed: np.ndarray
-
-    def overlapping(self) -> np.ndarray:
-        """Whether two of them overlap, [episodes]."""
-        pose = routes().pose(self.route, self.s)
-        hit = rectangles_overlap(pose[:, :, None], pose[:, None])
-        hit &= self.present[:, :, None] & self.present[:, None]
-        return hit.sum((1, 2)) > self.present.sum(1)
-
-    def stuck(self, ego_route: np.ndarray) -> np.ndarray:
-        """Whether one that is not queueing behind the ego stands short of the box's end."""
-        table = routes()
-        standing = self.present & (self.speed < 0.1)
-        standing &= self.s < table.out[self.route] + LENGTH / 2
-        return (standing & (table.approach[self.route] != table.approach[ego_route][:, None])).any(
-            1
-        )
+def overlapping(vehicles: Vehicles) -> np.ndarray:
+    """Whether two of the surrounding vehicles [N, episodes] overlap, [episodes]."""
+    place, _ = lane_frames(lanes(vehicles.route, vehicles.s), vehicles.s)
+    hit = separation(place.at((slice(None), None)), place) <= 0
+    hit &= vehicles.present[:, None] & vehicles.present
+    return (hit.sum((0, 1)) > vehicles.present.sum(0)).numpy()
 
 
-def traffic(env: BatchedIntersection | HighwayIntersection) -> Traffic:
+def stuck(vehicles: Vehicles, ego_route: torch.Tensor) -> np.ndarray:
+    """Whether one that is not queueing behind the ego [episodes] stands short of the box's end."""
+    lane, own = lanes(vehicles.route, vehicles.s), lanes(ego_route, vehicles.s)
+    standing = vehicles.present & (vehicles.speed < 0.1)
+    standing &= vehicles.s < lane.out + LENGTH / 2
+    return (standing & (lane.approach != own.approach)).any(0).numpy()
+
+
+def traffic(env: BatchedIntersection | HighwayIntersection) -> Vehicles:
+    """The surrounding vehicles of every episode, each [N, episodes]."""
     if isinstance(env, BatchedIntersection):
-        vehicles = vehicles_of(env._state)
-        return Traffic(*(getattr(vehicles, name).T.numpy() for name in Traffic._fields))
-    most = env.scenario.traffic.vehicles[1]
-    table = Traffic(*(np.zeros((len(env.envs), most), kind) for kind in (bool, int, float, float)))
-    for k, one in enumerate(env.envs):
-        table.present[k, one.road.slot] = True
-        for name in ("route", "s", "speed"):
-            getattr(table, name)[k, one.road.slot] = getattr(one.road, name)
-    return table
+        return vehicles_of(env._state)
+    every = zip(*(one.road.surrounding for one in env.envs), strict=True)
+    return Vehicles(*(torch.stack(values, -1) for values in every))
 
 
 def park(env: BatchedIntersection | HighwayIntersection) -> None:
@@ -92,8 +78,8 @@ def play(kind: type, scenario: Scenario, driver: str, episodes: int) -> dict[str
             td = DRIVERS[driver](td)
         td = env.step(td)["next"]
         now, alive = traffic(env), ~done.squeeze(-1).numpy()
-        overlap |= now.overlapping() & alive
-        held = np.where(alive, now.stuck(td["route"].squeeze(-1).numpy()), held)
+        overlap |= overlapping(now) & alive
+        held = np.where(alive, stuck(now, td["route"].squeeze(-1)), held)
         # What an episode ended with; a batched one is driven on, and ignored.
         last = td.clone() if last is None else torch.where(done, last, td)
         done = done | td["done"]

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
+from numpy_routes import rectangles_overlap, routes
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from saferl.envs.intersection.dynamics import step_ego, to_physical
 from saferl.envs.intersection.geometry import TASKS
 from saferl.envs.intersection.highway import IntersectionEnv, register
-from saferl.envs.intersection.network import rectangles_overlap, routes
 
 CHEAP = {"steps": 1}  # where the cost is not looked at
 STILL = np.array([-1.0, 0.0], np.float32)
@@ -166,11 +166,11 @@ def test_a_collision_ends_the_episode_and_was_priced_before():
     env = IntersectionEnv(task="gs", vehicles=1)
     for seed in range(20):
         env.reset(seed=seed)
-        if len(env.road.s):
+        if env.road.traffic:
             break
     # Put the ego 7 m behind a vehicle (centres) and drive at it.
-    route, s = env.road.route[0], env.road.s[0]
-    x, y, phi = env.road.table.pose(route, s - 7.0)
+    ahead = env.road.traffic[0]
+    x, y, phi = routes().pose(ahead.route_id, ahead.s - 7.0)
     env.ego.place(torch.tensor([x, y, 12.0, 0.0, phi, 0.0]))
     env._observe()
     costs = []
@@ -190,7 +190,7 @@ def test_surrounding_vehicles_never_overlap():
         env.reset(seed=seed)
         for _ in range(40):
             *_, info = env.step(STILL)
-            pose = env.road.pose
+            pose = env.snapshot()[1][:, [0, 1, 4]]
             hit = rectangles_overlap(pose[:, None], pose)
             assert hit.sum() == len(pose)
             assert not info["collision"]  # nobody hits an ego that brakes and stands

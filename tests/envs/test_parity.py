@@ -1,4 +1,4 @@
-"""The batched intersection against highway-env's classes and the road on them, from the same states.
+"""The batched intersection against highway-env's classes, the road on them and the rules in NumPy.
 
 Everything batched runs in float64 here, so that what differs is a fault and not rounding.
 """
@@ -13,6 +13,8 @@ import pytest
 import torch
 from highway_env import utils
 from highway_env.vehicle.behavior import IDMVehicle
+from numpy_road import NumpyRoad
+from numpy_routes import routes
 from tensordict import TensorDict
 
 from saferl.envs.intersection import SCENARIOS, IntersectionEnv, Scenario, Traffic
@@ -21,13 +23,14 @@ from saferl.envs.intersection.batched import advance, begin, look, vehicles_of
 from saferl.envs.intersection.cost import CollisionCost
 from saferl.envs.intersection.drivers import CautiousDriver
 from saferl.envs.intersection.geometry import ARM, LENGTH, WIDTH, frame, overlap
-from saferl.envs.intersection.network import build_network, routes
+from saferl.envs.intersection.network import build_network
 from saferl.envs.intersection.observation import FORMS
 from saferl.envs.intersection.regulation import IntersectionRoad
 from saferl.envs.intersection.roads import lane_frames, lane_project, lanes, pairs, zones
 from saferl.envs.intersection.spawning import Drawn, draw_traffic
-from saferl.envs.intersection.traffic import Vehicles, accelerate, road_rules, vehicle_states
+from saferl.envs.intersection.traffic import Vehicles, accelerate, drive_in, vehicle_states
 from saferl.envs.intersection.vehicles import EgoVehicle, RouteVehicle
+from saferl.envs.intersection.yielding import road_rules
 from saferl.envs.seeding import episode_seeds
 
 F64 = torch.float64
@@ -127,14 +130,12 @@ def test_idm_is_highway_envs_but_from_bumper_to_bumper(route, speeds):
 # --- who yields to whom --------------------------------------------------------------------------
 
 
-def numpy_road(vehicles, ego=None):
-    road = IntersectionRoad()
+def numpy_road(vehicles, ego):
     route, s, speed = (torch.tensor(column) for column in zip(*vehicles, strict=True))
     s, speed = s.double(), speed.double()
     yes = torch.ones_like(route, dtype=torch.bool)
-    car = None if ego is None else EgoVehicle(road, torch.tensor(ego, dtype=F64), 1)
-    road.populate(car, Drawn(yes, route, s, speed, torch.full_like(s, 1.2), ~yes))
-    return road
+    drawn = Drawn(yes, route, s, speed, torch.full_like(s, 1.2), ~yes)
+    return NumpyRoad(drawn, torch.tensor(ego, dtype=F64), 1)
 
 
 def decide(vehicles, lane, ego, ego_route=1):
@@ -164,21 +165,25 @@ def test_who_yields_is_the_same_for_every_pair_of_routes(places):
     assert len(seen) > 1
 
 
+def scene_of_ten(seed):
+    """Vehicles drawn for an ego that comes from 45 m before the box, its state and its route."""
+    route = seed % 4
+    x, y, phi = routes().pose(route, 70.0)
+    ego = torch.tensor([x, y, 6.0, 0.0, phi, 0.0], dtype=F64)
+    traffic = Traffic(heedless=0.2, headways=(0.6, 2.0))
+    drawn = draw_traffic(traffic, torch.tensor([route]), ego[None], episode_seeds(seed, 1))
+    return Drawn(*(value[0] for value in drawn)), ego, route
+
+
 def test_scenes_of_ten_are_decided_alike_all_the_way():
     assert sum(waits_in_a_scene(seed) for seed in range(6)) > 20
 
 
 def waits_in_a_scene(seed) -> int:
-    """Compares decisions and accelerations for 15 s, the batch copied from the road every 0.2 s."""
-    seeds = episode_seeds(seed, 1)
-    route = torch.tensor([seed % 4])
-    ego = torch.zeros(1, 6, dtype=F64)
-    pose = routes().pose(seed % 4, 70.0)
-    ego[0] = torch.tensor([pose[0], pose[1], 6.0, 0.0, pose[2], 0.0])
-    drawn = draw_traffic(Traffic(heedless=0.2, headways=(0.6, 2.0)), route, ego, seeds)
-    road = IntersectionRoad()
-    car = EgoVehicle(road, ego[0], seed % 4)
-    road.populate(car, Drawn(*(value[0] for value in drawn)))
+    """Compares decisions and accelerations for 15 s, the batch copied from NumPy's every 0.2 s."""
+    drawn, start, route = scene_of_ten(seed)
+    car = EgoVehicle(IntersectionRoad(), start, route)
+    road, own_route = NumpyRoad(drawn, start, route), torch.tensor([route])
     waits = 0
     for tick in range(75):
         count = len(road.s)
@@ -186,8 +191,8 @@ def waits_in_a_scene(seed) -> int:
             "route", "s", "speed", "desired", "headway", "heedless", "entered", "held", "stop"
         )}  # fmt: skip
         vehicles = Vehicles(torch.ones(count, 1, dtype=torch.bool), **column)
-        lane, own = lanes(vehicles.route, vehicles.s), lanes(route, vehicles.s)
-        zone = zones(vehicles.route, torch.cat([vehicles.route, route[None]]), vehicles.s)
+        lane, own = lanes(vehicles.route, vehicles.s), lanes(own_route, vehicles.s)
+        zone = zones(vehicles.route, torch.cat([vehicles.route, own_route[None]]), vehicles.s)
         time = torch.full((1,), road.time, dtype=F64)
         decided = road_rules(vehicles, lane, own, zone, car.state[None], time)
         road.enforce_road_rules()
@@ -205,12 +210,45 @@ def waits_in_a_scene(seed) -> int:
             ours = accelerate(decided, lane, pairs(decided.route), car.state[None])[:, 0]
             road.act()
             np.testing.assert_allclose(ours, road.acceleration, atol=1e-9)
+            car.step(1 / 15)
+            road.ego = car.state
             road.step(1 / 15)
             if len(road.s) != count:
                 break
         if tick > 25:
             car.act(torch.tensor([-2.0, 0.0]))
     return waits
+
+
+@pytest.mark.parametrize("seed", range(10, 14))
+def test_the_road_of_objects_goes_on_as_the_rules_in_numpy_do(seed):
+    """Both play the same scene for 20 s, neither told what the other does."""
+    drawn, start, route = scene_of_ten(seed)
+    road, waits = IntersectionRoad(), 0
+    car = EgoVehicle(road, start, route)
+    road.populate(car, drive_in(drawn, F64))
+    theirs = NumpyRoad(drawn, start, route)
+    for tick in range(300):
+        if tick > 75:
+            car.act(torch.tensor([-2.0, 0.0]))
+        road.act()
+        theirs.act()
+        ours = road.surrounding
+        assert ours.present.numpy().nonzero()[0].tolist() == theirs.number.tolist()
+        np.testing.assert_array_equal(ours.held[ours.present], theirs.held)
+        np.testing.assert_allclose(ours.stop[ours.present], theirs.stop, atol=1e-9)
+        there = torch.cat([ours.present, torch.ones(1, dtype=torch.bool)])
+        np.testing.assert_allclose(ours.entered[there], theirs.entered, atol=1e-9)
+        np.testing.assert_allclose(road.acceleration[ours.present], theirs.acceleration, atol=1e-7)
+        waits += int(theirs.held.any())
+        road.step(1 / 15)
+        theirs.ego = car.state
+        theirs.step(1 / 15)
+        np.testing.assert_allclose(
+            road.states[road.surrounding.present][:, :3], theirs.states()[:, :3], atol=1e-7
+        )
+    assert waits > 10
+    assert len(theirs.s) < int(drawn.present.sum())  # some have left by then
 
 
 # --- whole episodes ------------------------------------------------------------------------------
@@ -242,7 +280,8 @@ def test_an_episode_is_the_same_on_both_backends(task, name, observation):
         view = {"ego": state["seen_ego"], "vehicles": state["seen_vehicles"]}
         np.testing.assert_allclose(view["ego"][0], seen["ego"], atol=1e-4)
         np.testing.assert_allclose(view["vehicles"][0], seen["vehicles"], atol=1e-4)
-        assert int(vehicles_of(state).present.sum()) == len(env.road.s)
+        present = vehicles_of(state).present[:, 0].tolist()
+        assert present == env.road.surrounding.present.tolist()
         reads = TensorDict({**view, "route": state["route"][:, None]}, batch_size=[1])
         action = driver(reads)["action"]
         action = (action + 0.2 * torch.randn(1, 2, generator=generator)).clamp(-1, 1)

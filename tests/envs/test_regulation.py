@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from highway_env import utils
+from numpy_routes import rectangles_overlap, routes
 
 from saferl.envs.intersection.geometry import (
     ARM,
@@ -18,9 +19,11 @@ from saferl.envs.intersection.geometry import (
     overlap,
     reference_lines,
 )
-from saferl.envs.intersection.network import build_network, rectangles_overlap, routes
+from saferl.envs.intersection.network import build_network
 from saferl.envs.intersection.regulation import IntersectionRoad
+from saferl.envs.intersection.roads import BODY_STEP, bodies, lanes, pairs, zones
 from saferl.envs.intersection.spawning import Drawn, Traffic, draw_traffic
+from saferl.envs.intersection.traffic import drive_in
 from saferl.envs.intersection.vehicles import EgoVehicle
 from saferl.envs.seeding import episode_seeds
 
@@ -29,25 +32,32 @@ SOUTH, WEST, NORTH, EAST = 0, 4, 8, 12  # first route of each arm
 LEFT, INNER, OUTER, RIGHT = 0, 1, 2, 3
 
 
-def make_road(*vehicles: tuple[int, float, float], ego: tuple | None = None) -> IntersectionRoad:
-    """A road with vehicles (route, arc length, speed) and perhaps an ego (route, s, speed)."""
+AWAY = (OUTER, -100.0, 0.0)  # an ego that stands where nobody comes
+
+
+def make_road(*vehicles: tuple[int, float, float], ego: tuple = AWAY) -> IntersectionRoad:
+    """A road with vehicles (route, arc length, speed) and an ego (route, s, speed)."""
     road = IntersectionRoad()
-    car = None
-    if ego is not None:
-        route, s, speed = ego
-        x, y, phi = road.table.pose(route, np.float64(s))
-        state = torch.tensor([x, y, speed, 0.0, phi, 0.0], dtype=torch.float64)
-        car = EgoVehicle(road, state, route)
+    route, s, speed = ego
+    x, y, phi = routes().pose(route, np.float64(s))
+    state = torch.tensor([x, y, speed, 0.0, phi, 0.0], dtype=torch.float64)
+    car = EgoVehicle(road, state, route)
     route, s, speed = (torch.tensor(column) for column in zip(*vehicles, strict=True))
     s, speed = s.double(), speed.double()
     yes = torch.ones(len(route), dtype=torch.bool)
-    road.populate(car, Drawn(yes, route, s, speed, torch.full_like(s, 1.2), ~yes))
+    drawn = Drawn(yes, route, s, speed, torch.full_like(s, 1.2), ~yes)
+    road.populate(car, drive_in(drawn, torch.float64))
     return road
 
 
+def poses(road: IntersectionRoad) -> np.ndarray:
+    """Poses [N, 3] of the vehicles that are on the road."""
+    return road.states[road.surrounding.present][:, [0, 1, 4]].numpy()
+
+
 def overlaps(road: IntersectionRoad) -> bool:
-    hit = rectangles_overlap(road.pose[:, None], road.pose)
-    return hit.sum() > len(road.pose)
+    pose = poses(road)
+    return rectangles_overlap(pose[:, None], pose).sum() > len(pose)
 
 
 def play(road: IntersectionRoad, seconds: float):
@@ -77,8 +87,8 @@ def test_lanes_and_priorities_are_as_in_highway_env():
 
 def test_routes_run_along_the_networks_lanes():
     network, table = build_network(), routes()
-    for route, lanes in enumerate(table.lanes):
-        for index, begin in zip(lanes, (0.0, ARM, table.out[route]), strict=True):
+    for route, indexes in enumerate(table.lanes):
+        for index, begin in zip(indexes, (0.0, ARM, table.out[route]), strict=True):
             lane = network.get_lane(index)
             for s in np.linspace(0.01, lane.length - 0.01, 7):
                 pose = table.pose(route, np.float64(begin + s))
@@ -96,6 +106,32 @@ def test_the_south_routes_are_the_egos_reference_lines(route):
     np.testing.assert_allclose(pose[:, :2], expected[:, :2], atol=1e-9)
     np.testing.assert_allclose(np.cos(pose[:, 2]), np.cos(expected[:, 2]), atol=1e-9)
     assert ROUTES[route] == ("lt", "gs_inner", "gs_outer", "rt")[route]
+
+
+def test_the_tables_are_those_read_off_highway_envs_lanes():
+    table, everyone = routes(), torch.arange(16)
+    lane = lanes(everyone, torch.zeros(1, dtype=torch.float64))
+    read = {
+        name: getattr(table, name)
+        for name in ("heading", "out", "priority", "turn_speed", "approach")
+    }
+    (read["x"], read["y"]), (read["out_x"], read["out_y"]) = table.start.T, table.leave.T
+    for whose, angle in (("", table.heading), ("out_", table.turned)):
+        read |= {whose + "cos": np.cos(angle), whose + "sin": np.sin(angle)}
+    bend = np.abs(table.curvature)
+    read |= {"side": np.sign(table.curvature), "radius": 1 / np.where(bend == 0, 1.0, bend)}
+    assert set(read) == set(lane._fields)
+    for name, value in read.items():
+        np.testing.assert_allclose(getattr(lane, name), value, rtol=1e-15, atol=1e-15, err_msg=name)
+    zone = torch.stack(zones(everyone, everyone, lane.x), -1)
+    np.testing.assert_array_equal(zone, table.zone)
+    i, j = np.arange(16)[:, None], np.arange(16)
+    for k in range(table.body.shape[2]):
+        s = torch.full((16,), k * BODY_STEP, dtype=torch.float64)
+        where, aligned = bodies(pairs(everyone), s)
+        theirs = table.body[i % 4, (j - i // 4 * 4) % 16, k]
+        np.testing.assert_allclose(where - s, theirs[..., 0], atol=1e-12)
+        np.testing.assert_allclose(aligned, theirs[..., 1], atol=1e-12)
 
 
 def test_projection_inverts_the_pose():
@@ -176,12 +212,14 @@ def test_the_lower_priority_waits_at_the_line(first, second):
     waited, order, passed = False, [], [False, False]
     for _ in play(road, 12.0):
         assert not overlaps(road)
-        assert not road.held[0]
-        waited |= bool(road.held[1])
-        if road.held[1]:
-            assert road.s[1] + LENGTH / 2 <= ARM + 0.2
+        s, held = road.surrounding.s, road.surrounding.held
+        assert not held[0]
+        waited |= bool(held[1])
+        assert road.traffic[1].is_yielding == bool(held[1])
+        if held[1]:
+            assert s[1] + LENGTH / 2 <= ARM + 0.2
         for k, zone in enumerate((table.zone[first, second], table.zone[second, first])):
-            if not passed[k] and road.s[k] > zone[0] + 1.0:
+            if not passed[k] and s[k] > zone[0] + 1.0:
                 passed[k] = True
                 order.append(k)
     assert waited
@@ -192,9 +230,9 @@ def test_a_vehicle_in_the_box_is_not_stopped_by_priority():
     # A vertical left turn (priority 0) is inside when a horizontal vehicle (3) comes up.
     road = make_road((SOUTH + LEFT, 101.0, 6.0), (WEST + INNER, 75.0, 9.0))
     for _ in play(road, 6.0):
-        assert not road.held[0]
+        assert not road.surrounding.held[0]
         assert not overlaps(road)
-    assert road.s[0] > routes().out[0]
+    assert road.surrounding.s[0] > routes().out[0]
 
 
 @pytest.mark.parametrize("movement", [LEFT, INNER, OUTER])
@@ -202,16 +240,17 @@ def test_four_at_once_resolve(movement):
     road = make_road(*((arm + movement, 70.0, 8.0) for arm in (SOUTH, WEST, NORTH, EAST)))
     for _ in play(road, 20.0):
         assert not overlaps(road)
-    assert (road.s > road.table.out[road.route]).all()
+    ahead = road.surrounding.s.numpy() - routes().out[road.surrounding.route]
+    assert (ahead > 0).all()
 
 
 def test_leaders_are_seen_across_lane_segments():
     # The ego stands in the box, on the next lane segment of the follower.
     road = make_road((SOUTH + INNER, 60.0, 9.0), ego=(SOUTH + INNER, 112.0, 0.0))
     for _ in play(road, 10.0):
-        gap = 112.0 - road.s[0] - LENGTH
+        gap = 112.0 - road.surrounding.s[0] - LENGTH
         assert gap > 1.0
-    assert road.speed[0] < 0.1
+    assert road.surrounding.speed[0] < 0.1
 
 
 def test_nobody_hits_an_ego_that_stands_across_the_box():
@@ -219,7 +258,7 @@ def test_nobody_hits_an_ego_that_stands_across_the_box():
     road = make_road(*others, ego=(SOUTH + LEFT, 112.0, 0.0))
     pose = np.array([*road.ego.position, road.ego.heading])
     for _ in play(road, 15.0):
-        assert not rectangles_overlap(pose, road.pose).any()
+        assert not rectangles_overlap(pose, poses(road)).any()
         assert not overlaps(road)
 
 
@@ -234,13 +273,12 @@ def test_traffic_is_predicted_along_its_route():
 
 def test_states_hold_the_prediction_models_yaw_rate():
     road = make_road((SOUTH + LEFT, 110.0, 8.0), (SOUTH + RIGHT, 105.0, 6.0), (8, 50.0, 7.0))
-    states = road.states()
+    states = road.states.numpy()
     np.testing.assert_allclose(states[:, 5], [-8 / 17, 6 / 9, 0.0])
     np.testing.assert_allclose(states[:, 2:4], [[8, 0], [6, 0], [7, 0]])
     before = states[:2, [0, 1, 4]]
-    road.acceleration[:] = 0.0
-    road.step(1e-4)
-    rate = (road.states()[:2, [0, 1, 4]] - before) / 1e-4
+    road.step(1e-4)  # without accelerations, which nobody has decided
+    rate = (road.states.numpy()[:2, [0, 1, 4]] - before) / 1e-4
     np.testing.assert_allclose(np.hypot(rate[:, 0], rate[:, 1]), [8, 6], rtol=1e-3)
     np.testing.assert_allclose(rate[:, 2], [-8 / 17, 6 / 9], rtol=1e-3)
 
@@ -249,8 +287,32 @@ def test_vehicles_leave_at_the_end_of_their_exit_arm():
     road = make_road((WEST + INNER, 226.0, 9.0), (EAST + INNER, 100.0, 9.0))
     for _ in play(road, 0.5):
         pass
-    assert road.route.tolist() == [EAST + INNER]
-    assert len(road.vehicles) == len(road.traffic) == len(road.held) == 1
+    assert road.surrounding.present.tolist() == [False, True]
+    assert list(road.traffic) == [1]
+    assert road.vehicles == [road.ego, road.traffic[1]]
+
+
+def test_the_objects_follow_the_vehicles():
+    road = make_road(
+        (SOUTH + LEFT, 92.0, 8.0), (EAST + RIGHT, 96.0, 6.0), (NORTH + OUTER, 60.0, 9.0)
+    )
+    segments = set()
+    for _ in play(road, 4.0):
+        vehicles = road.surrounding
+        for number, car in road.traffic.items():
+            assert car.s == vehicles.s[number]
+            assert car.speed == vehicles.speed[number]
+            assert car.action["acceleration"] == road.acceleration[number]
+            pose = routes().pose(car.route_id, car.s)
+            np.testing.assert_allclose(car.position, pose[:2], atol=1e-9)
+            assert abs(utils.wrap_to_pi(car.heading - pose[2])) < 1e-9
+            longitudinal, lateral = car.lane.local_coordinates(car.position)
+            assert abs(lateral) < 1e-6
+            assert -1e-6 <= longitudinal <= car.lane.length + 1e-6
+            assert car.lane is road.network.get_lane(car.lane_index)
+            assert car.route[0] == car.lane_index
+            segments.add((number, car.lane_index))
+    assert len(segments) >= 6  # two of them see all of their lanes
 
 
 def test_spawning_keeps_its_distances_and_ranges():

@@ -20,7 +20,7 @@ from saferl.envs.intersection.geometry import ROUTES, ROUTES_OF_TASK
 from saferl.envs.intersection.observation import FORMS, ROWS, Form
 from saferl.envs.intersection.reward import Reward
 from saferl.envs.intersection.spawning import SCENARIOS, Traffic
-from saferl.envs.intersection.traffic import PERIOD
+from saferl.envs.intersection.yielding import PERIOD
 from saferl.envs.seeding import SeededEnv
 
 SUBSTEPS = 3

@@ -21,15 +21,16 @@ from saferl.envs.intersection.dynamics import step_ego, to_physical
 from saferl.envs.intersection.geometry import arrived, columns, frame, offroad, separation
 from saferl.envs.intersection.observation import observe
 from saferl.envs.intersection.roads import Lanes, lane_frames, lanes, pairs, zones
-from saferl.envs.intersection.spawning import (
-    Drawn,
-    draw_route,
-    draw_start,
-    draw_traffic,
-    enter,
-    sense,
+from saferl.envs.intersection.spawning import draw_route, draw_start, draw_traffic, sense
+from saferl.envs.intersection.traffic import (
+    Vehicles,
+    accelerate,
+    drive_in,
+    move,
+    respawn,
+    vehicle_states,
 )
-from saferl.envs.intersection.traffic import Vehicles, accelerate, move, road_rules, vehicle_states
+from saferl.envs.intersection.yielding import road_rules
 
 State = dict[str, Tensor]
 _VEHICLE, _LANE, _OWN = "vehicle_", "lane_", "own_"
@@ -75,23 +76,11 @@ def _choose(mask: Tensor, yes: Vehicles, no: Vehicles) -> Vehicles:
     return Vehicles(*(torch.where(mask, a, b) for a, b in zip(yes, no, strict=True)))
 
 
-def _drivers(drawn: Drawn) -> Vehicles:
-    """Vehicles [N, B] that have just been drawn, [B, N]."""
-    present, route, s, speed, headway, heedless = (v.movedim(-1, 0) for v in drawn)
-    s, speed, headway = s.float(), speed.float(), headway.float()
-    never = torch.full_like(s, torch.inf)
-    return Vehicles(
-        present, route, s, speed, speed, headway, heedless,
-        entered=torch.full((len(s) + 1, *s.shape[1:]), torch.inf, device=s.device),
-        held=torch.zeros_like(present), stop=never,
-    )  # fmt: skip
-
-
 def begin(scenario: Scenario, seed: Tensor) -> State:
     """The first states of the episodes with seeds [B] int64, each tensor [B, ...]."""
     route = draw_route(scenario.task, seed)
     ego = draw_start(route, seed, scenario.route_starts)
-    vehicles = _drivers(draw_traffic(scenario.traffic, route, ego, seed))
+    vehicles = drive_in(draw_traffic(scenario.traffic, route, ego, seed), torch.float32)
     state = {
         "seed": seed, "route": route, "ego": ego.float(),
         "steps": torch.zeros_like(seed), "still": torch.zeros_like(seed),
@@ -118,21 +107,6 @@ def restart(scenario: Scenario, state: State, seed: Tensor, reset: Tensor, rows:
         return old.index_copy(-1, rows, new).movedim(-1, 0)
 
     return scenes_last({key: merge(old, fresh[key]) for key, old in state.items()})
-
-
-def _respawn(scenario: Scenario, vehicles: Vehicles, state: State) -> Vehicles:
-    present, route, s = (v.movedim(0, -1) for v in (vehicles.present, vehicles.route, vehicles.s))
-    fresh = enter(
-        scenario.traffic, state["route"], state["seed"], state["steps"], present, route, s
-    )
-    new = _drivers(fresh)
-    joins = new.present
-    never = torch.zeros_like(joins[:1])  # the ego
-    merged = (
-        torch.where(torch.cat([joins, never]) if name == "entered" else joins, ours, old)
-        for name, ours, old in zip(Vehicles._fields, new, vehicles, strict=True)
-    )
-    return Vehicles(*merged)
 
 
 def look(scenario: Scenario, state: State) -> tuple[State, Tensor]:
@@ -199,7 +173,7 @@ def advance(scenario: Scenario, state: State, action: Tensor) -> tuple[State, St
         "still": torch.where(ego[:, 2] < STANDING, state["still"] + 1, 0),
     }
     if scenario.traffic.respawn:
-        vehicles = _respawn(scenario, vehicles, state)
+        vehicles = respawn(scenario.traffic, vehicles, route, state["seed"], steps)
         after |= _roads(vehicles, route)
     after |= _named(_VEHICLE, vehicles)
     seen, own = look(scenario, after)
@@ -286,7 +260,8 @@ class BatchedIntersection(IntersectionBase):
         """The scene [600, 600, 3] uint8 of one environment, drawn by highway-env's graphics."""
         from saferl.envs.intersection.rendering import draw_state  # late: needs pygame
 
-        return draw_state({key: value[index].cpu() for key, value in self._state.items()})
+        state = {key: value[index].cpu() for key, value in self._state.items()}
+        return draw_state(state["ego"], int(state["route"]), vehicles_of(state))
 
     def state_dict(self, *args, **kwargs) -> dict[str, Tensor]:
         """Everything that decides what comes next: vehicle states and episode sequences."""

@@ -16,7 +16,7 @@ from saferl.envs.intersection.geometry import (
     wrap,
 )
 from saferl.envs.intersection.observation import as_world
-from saferl.envs.intersection.traffic import STOP
+from saferl.envs.intersection.yielding import STOP
 from saferl.envs.seeding import mix, uniform
 
 CRUISE = 9.0  # m/s

@@ -20,8 +20,8 @@ from saferl.envs.intersection.geometry import (
     TASKS,
     arrived,
     offroad,
+    overlap,
 )
-from saferl.envs.intersection.network import rectangles_overlap
 from saferl.envs.intersection.observation import ROWS, observe
 from saferl.envs.intersection.regulation import IntersectionRoad
 from saferl.envs.intersection.rendering import Renderer
@@ -31,9 +31,9 @@ from saferl.envs.intersection.spawning import (
     draw_route,
     draw_start,
     draw_traffic,
-    enter,
     sense,
 )
+from saferl.envs.intersection.traffic import drive_in, respawn
 from saferl.envs.intersection.vehicles import EgoVehicle
 
 
@@ -115,7 +115,8 @@ class IntersectionEnv(gymnasium.Env):
 
     def snapshot(self) -> tuple[np.ndarray, np.ndarray]:
         """States of the ego [6] and of the surrounding vehicles [N, 6], float64, for plots."""
-        return self.ego.state.numpy().copy(), self.road.states()
+        present = self.road.surrounding.present
+        return self.ego.state.numpy().copy(), self.road.states[present].numpy()
 
     def _choose_route(self, options: Mapping[str, Any], seed: torch.Tensor) -> torch.Tensor:
         if (name := options.get("route")) is not None:
@@ -151,37 +152,26 @@ class IntersectionEnv(gymnasium.Env):
         ego = EgoVehicle(self.road, start, int(self._route))
         self._seed, self._steps, self._still, self._control = draw, 0, 0, None
         traffic = draw_traffic(self.scenario.traffic, self._route, start, draw)
-        self.road.populate(ego, traffic)
+        self.road.populate(ego, drive_in(traffic, torch.float64))
         return self._observe(), self._info(0.0, False, False, False)
 
     def _observe(self) -> dict[str, np.ndarray]:
         scenario, state = self.scenario, self.ego.state
-        self._vehicles = others = torch.from_numpy(self.road.states())
-        present = torch.ones(len(others), dtype=torch.bool)
+        self._vehicles = others = self.road.states
+        present = self.road.surrounding.present
         how = scenario.rows, scenario.observation
         self._own, table, self._observed = observe(state, others, present, self._route, *how)
         own = self._own
         if not scenario.traffic.sensed_exactly:
-            slot, steps = torch.from_numpy(self.road.slot), torch.tensor(self._steps)
+            slot, steps = torch.arange(len(others)), torch.tensor(self._steps)
             sensed = sense(scenario.traffic, others, present, slot, self._seed, steps)
             own, table, _ = observe(state, *sensed, self._route, *how)
         return {"ego": own.float().numpy(), "vehicles": table.float().numpy()}
 
     def _respawn(self) -> None:
         """Let one vehicle that has left the road enter it again, if its approach is free."""
-        road, most = self.road, self.scenario.traffic.vehicles[1]
-        present = torch.zeros(most, dtype=torch.bool)
-        route, s = torch.zeros(most, dtype=torch.int64), torch.zeros(most, dtype=torch.float64)
-        slot = torch.from_numpy(road.slot)
-        present[slot], route[slot], s[slot] = (
-            True,
-            torch.from_numpy(road.route),
-            torch.from_numpy(road.s),
-        )
-        steps = torch.tensor(self._steps)
-        fresh = enter(self.scenario.traffic, self._route, self._seed, steps, present, route, s)
-        if fresh.present.any():
-            road.add(fresh)
+        now, steps = self.road.surrounding, torch.tensor(self._steps)
+        self.road.replace(respawn(self.scenario.traffic, now, self._route, self._seed, steps))
 
     def _info(self, cost: float, collision: bool, off: bool, success: bool) -> dict[str, Any]:
         route = int(self._route)
@@ -195,9 +185,8 @@ class IntersectionEnv(gymnasium.Env):
         }
 
     def _collides(self) -> bool:
-        ego = self.ego
-        pose = np.array([*ego.position, ego.heading])
-        return bool(rectangles_overlap(pose, self.road.pose).any())
+        ego, others = (state[..., [0, 1, 4]] for state in (self.ego.state, self.road.states))
+        return bool((overlap(ego, others) & self.road.surrounding.present).any())
 
     def step(
         self, action: np.ndarray

@@ -66,8 +66,9 @@ class HighwayIntersection(ReplayedEnv, IntersectionBase):
         """States of the ego [6] and of the others [N, 6], float64: row k is vehicle k, NaN while it
         is not on the road."""
         ego, there = self.envs[index].snapshot()
-        others = np.full((self.scenario.traffic.vehicles[1], 6), np.nan)
-        others[self.envs[index].road.slot] = there
+        present = self.envs[index].road.surrounding.present.numpy()
+        others = np.full((len(present), 6), np.nan)
+        others[present] = there
         return ego, others
 
     def render(self, index: int) -> np.ndarray | None:

@@ -13,6 +13,7 @@ from saferl.envs.intersection.geometry import ARM, CURB_RADIUS, HALF_BOX, LANE_W
 
 if TYPE_CHECKING:
     from saferl.envs.intersection.regulation import IntersectionRoad
+    from saferl.envs.intersection.traffic import Vehicles
 
 _HALF_ROAD, _END = 2 * LANE_WIDTH, HALF_BOX + ARM
 #: The pavement, as (x, y, width, height) of rectangles, m.
@@ -88,21 +89,16 @@ def _stage() -> tuple[IntersectionRoad, Renderer]:
     return IntersectionRoad(), Renderer()
 
 
-def draw_state(state: dict[str, Tensor]) -> np.ndarray:
+def draw_state(ego: Tensor, route: int, vehicles: Vehicles) -> np.ndarray:
     """The picture [600, 600, 3] uint8 of one environment of the batched intersection.
 
     Args:
-        state: on the CPU, ``ego`` [6], ``route`` [], and ``vehicle_present``, ``vehicle_route``,
-            ``vehicle_s``, ``vehicle_speed``, ``vehicle_headway``, ``vehicle_heedless`` and
-            ``vehicle_held`` [N]; see :func:`~saferl.envs.intersection.batched.begin`.
+        ego: state [6], on the CPU.
+        route: the ego's, in :data:`~saferl.envs.intersection.geometry.ROUTES`.
+        vehicles: surrounding ones, each [N], on the CPU.
     """
-    from saferl.envs.intersection.spawning import Drawn
     from saferl.envs.intersection.vehicles import EgoVehicle
 
     road, renderer = _stage()
-    ego = EgoVehicle(road, state["ego"], int(state["route"]))
-    road.populate(ego, Drawn(*(state["vehicle_" + name] for name in Drawn._fields)))
-    held = state["vehicle_held"][state["vehicle_present"]].tolist()
-    for vehicle, yields in zip(road.traffic, held, strict=True):
-        vehicle.is_yielding = yields
+    road.populate(EgoVehicle(road, ego, route), vehicles)
     return renderer.draw(road)

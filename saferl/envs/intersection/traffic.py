@@ -1,9 +1,9 @@
-"""Surrounding traffic as one batch of tensors: yielding, IDM, motion along routes.
+"""Surrounding traffic as one batch of tensors: IDM and motion along routes, coming and going.
 
-The rules are those of :class:`~saferl.envs.intersection.regulation.IntersectionRoad`, which states
-them and applies them to highway-env's vehicles. Here the N vehicles of any number of scenes come
-first, [N, ...], pairs are [N, T, ...], and T = N + 1 counts the ego too, last: the scenes lie side by
-side in memory, where vector units find them.
+Both backends drive their traffic by these functions. The N vehicles of any number of scenes come first,
+[N, ...]: the scenes lie side by side in memory, where vector units find them. Any body in a vehicle's
+corridor ahead is a leader, whatever lane it is on. Who yields to whom is in
+:mod:`~saferl.envs.intersection.yielding`.
 """
 
 from __future__ import annotations
@@ -13,24 +13,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from saferl.envs.intersection.geometry import ARM, LENGTH, WIDTH, Frame, frame, separation
-from saferl.envs.intersection.network import BODY, CORRIDOR
-from saferl.envs.intersection.roads import Lanes, bodies, lane_frames, lane_project
+from saferl.envs.intersection.geometry import ARM, LENGTH, frame
+from saferl.envs.intersection.roads import BODY, CORRIDOR, Lanes, bodies, lane_frames, lane_project
+from saferl.envs.intersection.spawning import Drawn, Traffic, enter
 
-PERIOD = 0.2  # s between two decisions of the traffic, at any policy frequency
-TIMES = tuple(0.25 * k for k in range(1, 9))  # s, of the prediction: 2 s (paper)
-STRETCH = 1.5  # predicted rectangles are 1.5 times as long, as in highway-env
-GO_SPEED = 4.0  # m/s, least speed at which a vehicle predicts its own crossing
-COMMIT = 5.0  # m/s^2; a vehicle that could not stop with it before the box has entered
-STOP = ARM - LENGTH / 2 - 1.0  # m, where a yielding vehicle's centre stops
-TIME_MARGIN = 0.5 / 1.2  # s a second of headway, kept from others in the zone where routes cross
 BODY_GAP = 3.0  # m kept from a body across the corridor
-EGO_ROOM = 2.0  # m more for the ego, which keeps to no line
 ACCELERATION, BRAKING = 3.0, 5.0  # m/s^2, comfortable (IDM)
 ACC_MAX = 6.0  # m/s^2
-DELTA = 4.0  # exponent (IDM, as in highway-env)
 GAP = 3.0  # m, bumper to bumper at rest (IDM)
-_LANES = 8  # approach lanes: so many vehicles at most are the first on theirs
 
 
 class Vehicles(NamedTuple):
@@ -65,144 +55,37 @@ def vehicle_states(vehicles: Vehicles, lane: Lanes) -> Tensor:
     return torch.stack(states).movedim((0, 1), (-1, -2))
 
 
-def _and(values: Tensor, ego: Tensor) -> Tensor:
-    """Values of the vehicles [N, ...] and of the ego [...]: [T, ...]."""
-    return torch.cat([values, ego[None]])
+def drive_in(drawn: Drawn, dtype: torch.dtype) -> Vehicles:
+    """Vehicles [N, ...] that have just been drawn, [..., N]; their numbers in ``dtype``."""
+    present, route, s, speed, headway, heedless = (v.movedim(-1, 0) for v in drawn)
+    s, speed, headway = s.to(dtype), speed.to(dtype), headway.to(dtype)
+    never = torch.full_like(s, torch.inf)
+    return Vehicles(
+        present, route, s, speed, speed, headway, heedless,
+        entered=torch.full((len(s) + 1, *s.shape[1:]), torch.inf, dtype=dtype, device=s.device),
+        held=torch.zeros_like(present), stop=never,
+    )  # fmt: skip
 
 
-def road_rules(
-    vehicles: Vehicles,
-    lane: Lanes,
-    own: Lanes,
-    zone: tuple[Tensor, Tensor],
-    ego: Tensor,
-    time: Tensor,
+def respawn(
+    traffic: Traffic, vehicles: Vehicles, ego_route: Tensor, seed: Tensor, steps: Tensor
 ) -> Vehicles:
-    """Decide who waits at the line or brakes in the box; gives new ``entered``, ``held``, ``stop``.
+    """The vehicles [N, ...] with who enters the road after this decision, see :func:`enter`.
 
     Args:
+        traffic: settings.
         vehicles: each [N, ...].
-        lane, own: their lanes and the ego's.
-        zone: begin and end of where each can be hit by the others and the ego, [N, T, ...].
-        ego: state [..., 6].
-        time: since the start of the episode [...], s.
+        ego_route, seed, steps: int64 [...]; steps counts the decisions of the episode.
     """
-    s, speed, count = vehicles.s, vehicles.speed, len(vehicles.s)
-    ego_s, _ = lane_project(own, ego[..., 0], ego[..., 1])
-    turned = ego[..., 4] - lane_frames(own, ego_s)[1]
-    ego_pace = (torch.hypot(ego[..., 2], ego[..., 3]) * torch.cos(turned)).clamp_min(0.0)
-
-    all_s, all_speed = _and(s, ego_s), _and(speed, ego_pace)
-    yes = torch.ones_like(ego_s, dtype=torch.bool)
-    there = _and(vehicles.present, yes)
-    present = there & (all_s < _and(lane.out, own.out) + LENGTH / 2)  # not yet out of the box
-    to_line = ARM - LENGTH / 2 - all_s
-    unable = ~_and(vehicles.held, ~yes) & (all_speed.square() > 2 * COMMIT * (to_line - 0.5))
-    inside = present & ((to_line < 0) | unable)
-    entered = torch.where(inside, torch.minimum(vehicles.entered, time), torch.inf)
-
-    # Rank: order of entry, then road priority, then time to the line; ties by distance and number.
-    arrival = to_line.clamp_min(0.0) / all_speed.clamp_min(1.0)
-    right_of_way = _and(lane.priority, own.priority) * 100.0 - arrival
-    rank = torch.where(inside, 1000.0 - entered.clamp_max(600.0), right_of_way)
-    number = torch.arange(count + 1, device=s.device).reshape(-1, *[1] * ego_s.ndim)
-    mine, their = (slice(0, count), None), (None,)  # i and j of pairs [N, T, ...]
-    farther = all_s[their] > all_s[mine]
-    tie = farther | ((all_s[their] == all_s[mine]) & (number[their] < number[mine]))
-    above = _number((rank[their] > rank[mine]) | ((rank[their] == rank[mine]) & tie))
-
-    approach = _and(lane.approach, own.approach)
-    same = approach[their] == approach[mine]
-    waiting = present & ~inside
-    first = waiting[:count] & (_number(same & waiting[their] & farther).amax(1) == 0)
-
-    pace = speed.clamp_min(GO_SPEED)
-    gap = _gap(lane, s, pace, own, ego_s, ego_pace, ego)
-    meet = _number((gap <= 0) & ~same & there[their])
-    clash = _clash(vehicles, pace, zone[0][:, :count], zone[1][:, :count])
-
-    entrants = _number(inside)
-    blocked = (clash * entrants[None, :count]).amax(1)
-    gives_way = torch.cat([torch.maximum(meet[:, :count], clash), meet[:, count:]], 1) * above
-    held = _held(first, vehicles.heedless, blocked, gives_way, present[count:])
-
-    # Two that have entered and are bound for the same zone: the later one brakes before it.
-    begin = zone[0]
-    within = _number(s[:, None] >= begin)
-    wait = clash * torch.maximum(within[:, :count].transpose(0, 1), above[:, :count])
-    wait = torch.cat([wait, (meet * above)[:, count:]], 1)
-    wait = wait * (1 - within) * entrants[mine] * entrants[their]
-    room = torch.cat([begin[:, :count], begin[:, count:] - EGO_ROOM], 1)
-    stop = torch.where(wait > 0, room - 0.5, torch.inf).amin(1)
-    return vehicles._replace(entered=entered, held=held, stop=torch.where(held, STOP, stop))
-
-
-def _number(truth: Tensor) -> Tensor:
-    """1.0 and 0.0 for true and false: among many pairs, vector units are quicker with numbers."""
-    return torch.where(truth, 1.0, 0.0)
-
-
-def _held(
-    first: Tensor, heedless: Tensor, blocked: Tensor, gives_way: Tensor, ego_free: Tensor
-) -> Tensor:
-    """Who waits: a vehicle yields to those above it that do not wait themselves, bool [N, ...].
-
-    ``gives_way`` [N, T, ...] (1.0 or 0.0, as ``blocked`` [N, ...]) follows a total order, so as many rounds as there are approach lanes
-    settle it, from any start.
-    """
-    yields = first & ~heedless
-    blocked = torch.maximum(blocked, (gives_way[:, -1:] * _number(ego_free)).amax(1))
-    gives_way, yes = gives_way[:, :-1], _number(first)
-    held = yields & (blocked > 0)
-    for _ in range(_LANES):
-        free = torch.where(held, 0.0, yes)
-        held = yields & (torch.maximum(blocked, (gives_way * free[None]).amax(1)) > 0)
-    return held
-
-
-def _gap(
-    lane: Lanes, s: Tensor, pace: Tensor, own: Lanes, ego_s: Tensor, ego_pace: Tensor, ego: Tensor
-) -> Tensor:
-    """[N, T, ...]: the smallest separation of i and j within 2 s, m, both along their routes at constant
-    speed; the ego keeps its distance and angle to its route."""
-    times = torch.tensor(TIMES, dtype=s.dtype, device=s.device).reshape(-1, *[1] * s.ndim)
-    # [times, N, ...], stacked so that a compiler keeps them and does not redo them for every pair.
-    path = Frame(*torch.stack(lane_frames(lane, s + pace * times)[0]))
-    size = (STRETCH * LENGTH, WIDTH)
-    # Every pair once, then its number at both of its places; no vehicle meets itself.
-    count = len(s)
-    i, j = torch.triu_indices(count, count, 1, device=s.device)
-    gap = separation(path.at((slice(None), i)), path.at((slice(None), j)), size, size).amin(0)
-    number = torch.arange(count, device=s.device)
-    low, high = torch.minimum(number[:, None], number), torch.maximum(number[:, None], number)
-    place = torch.where(low == high, len(i), low * (2 * count - low - 1) // 2 + high - low - 1)
-    gap = torch.cat([gap, torch.full_like(s[:1], torch.inf)])[place]
-
-    here, heading = lane_frames(own, ego_s)
-    lateral = (ego[..., 1] - here.y) * here.cos - (ego[..., 0] - here.x) * here.sin
-    turned = ego[..., 4] - heading
-    c, sn = torch.cos(turned), torch.sin(turned)
-    x, y, cos, sin = lane_frames(own, ego_s + ego_pace * times[:, 0])[0]
-    beside = Frame(x - lateral * sin, y + lateral * cos, cos * c - sin * sn, sin * c + cos * sn)
-    ego_gap = separation(path, beside.at((slice(None), None)), size, size)
-    return torch.cat([gap, ego_gap.amin(0)[:, None]], 1)
-
-
-def _clash(vehicles: Vehicles, pace: Tensor, begin: Tensor, end: Tensor) -> Tensor:
-    """[N, N, ...], 1.0 or 0.0: would vehicle i, at ``pace`` [N, ...] m/s, meet j in the zone of their routes, which
-    lies at arc lengths ``begin`` to ``end`` [N, N, ...] of i's route?"""
-    s, their_s = vehicles.s[:, None], vehicles.s[None]
-    pace, slow = pace[:, None], vehicles.speed.clamp_min(0.5)[None]
-    margin = TIME_MARGIN * vehicles.headway[:, None]
-    their_begin, their_end = begin.transpose(0, 1), end.transpose(0, 1)
-    return _number(
-        torch.isfinite(begin)
-        & (s < end)
-        & (their_s < their_end)
-        & vehicles.present[None]
-        & ((begin - s) / pace < (their_end - their_s) / slow + margin)
-        & ((their_begin - their_s).clamp_min(0.0) / slow < (end - s) / pace + margin)
+    present, route, s = (v.movedim(0, -1) for v in (vehicles.present, vehicles.route, vehicles.s))
+    new = drive_in(enter(traffic, ego_route, seed, steps, present, route, s), vehicles.s.dtype)
+    joins = new.present
+    never = torch.zeros_like(joins[:1])  # the ego
+    merged = (
+        torch.where(torch.cat([joins, never]) if name == "entered" else joins, ours, old)
+        for name, ours, old in zip(Vehicles._fields, new, vehicles, strict=True)
     )
+    return Vehicles(*merged)
 
 
 def accelerate(vehicles: Vehicles, lane: Lanes, pair: Tensor, ego: Tensor) -> Tensor:

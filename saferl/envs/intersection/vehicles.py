@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,8 @@ from torch import Tensor
 
 from saferl.envs.intersection.dynamics import step_ego
 from saferl.envs.intersection.geometry import ARM, LENGTH, WIDTH
-from saferl.envs.intersection.network import Routes
+from saferl.envs.intersection.network import LANE_INDEXES
+from saferl.envs.intersection.roads import lane_frames, lanes
 from saferl.envs.intersection.traffic import ACC_MAX, ACCELERATION, BRAKING, GAP
 
 
@@ -25,9 +27,8 @@ class RouteVehicle(IDMVehicle):
 
     Args:
         road: the road it drives on.
-        route_id: its row in :class:`~saferl.envs.intersection.network.Routes`.
-        s: arc length of its centre along the route, m.
-        speed: m/s; also the speed that it wants.
+        route_id: in [0, 16), see :mod:`~saferl.envs.intersection.roads`.
+        desired: the speed that it wants, m/s.
         headway: s.
     """
 
@@ -36,31 +37,28 @@ class RouteVehicle(IDMVehicle):
     DISTANCE_WANTED = GAP + LENGTH  # m, centre to centre
     YIELDING_COLOR = (255, 170, 60)
 
-    def __init__(
-        self, road: Road, route_id: int, s: float, speed: float, headway: float, table: Routes
-    ):
+    def __init__(self, road: Road, route_id: int, desired: float, headway: float):
         # Without a road the base class does not search every lane for the closest one.
         nowhere: Any = None
-        super().__init__(nowhere, [0.0, 0.0], speed=speed, enable_lane_change=False, timer=0.0)
-        self.road, self.table, self.route_id = road, table, int(route_id)
-        self.route = list(table.lanes[route_id])
-        self.target_speed, self.TIME_WANTED = float(speed), float(headway)
+        super().__init__(nowhere, [0.0, 0.0], enable_lane_change=False, timer=0.0)
+        self.road, self.route_id = road, route_id
+        self.target_speed, self.TIME_WANTED = desired, headway
         self.is_yielding = False
         self.lane_index = None
-        self.follow(s, speed, 0.0, table.pose(route_id, s))
+        self._lane = lanes(torch.tensor(route_id), torch.zeros(1, dtype=torch.float64))
+        self._out = float(self._lane.out)
 
-    def follow(self, s: float, speed: float, acceleration: float, pose: np.ndarray) -> None:
-        """Take the place at arc length ``s`` with ``pose`` [3]; keeps lane and route up to date."""
-        self.s, self.speed = float(s), float(speed)
-        self.position = pose[:2]
-        self.heading = float(pose[2])
-        self.action = {"steering": 0.0, "acceleration": float(acceleration)}
-        segment = 0 if s <= ARM else 1 if s <= self.table.out[self.route_id] else 2
-        index = self.table.lanes[self.route_id][segment]
+    def follow(self, s: float, acceleration: float, state: Sequence[float]) -> None:
+        """Take the place at arc length ``s`` with ``state`` [6]; keeps lane and route up to date."""
+        x, y, self.speed, _, self.heading, _ = state
+        self.s, self.position = s, np.array([x, y])
+        self.action = {"steering": 0.0, "acceleration": acceleration}
+        segment = 0 if s <= ARM else 1 if s <= self._out else 2
+        index = LANE_INDEXES[self.route_id][segment]
         if index != self.lane_index:
             self.lane_index = self.target_lane_index = index
             self.lane = self.road.network.get_lane(index)
-            self.route = list(self.table.lanes[self.route_id][segment:])
+            self.route = list(LANE_INDEXES[self.route_id][segment:])
 
     @property
     def color(self) -> tuple[int, int, int] | None:
@@ -75,8 +73,9 @@ class RouteVehicle(IDMVehicle):
 
     def predict_trajectory_constant_speed(self, times) -> tuple[np.ndarray, np.ndarray]:
         """Positions [T, 2] and headings [T] along the route at constant speed."""
-        pose = self.table.pose(self.route_id, self.s + self.speed * np.asarray(times))
-        return pose[:, :2], pose[:, 2]
+        ahead = self.s + self.speed * torch.as_tensor(times, dtype=torch.float64)
+        place, heading = lane_frames(self._lane, ahead)
+        return torch.stack([place.x, place.y], -1).numpy(), heading.numpy()
 
 
 class EgoVehicle(Vehicle):
