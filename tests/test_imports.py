@@ -1,8 +1,11 @@
-"""Who may import whom, read off the source."""
+"""Who may import whom, read off the source, and what an interpreter has loaded."""
 
 from __future__ import annotations
 
 import ast
+import importlib
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -116,3 +119,44 @@ def test_there_is_no_cycle():
 
     for name in MODULES:
         visit(name, ())
+
+
+def fresh(code: str) -> str:
+    """What a new interpreter prints."""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout.strip()
+
+
+#: What the batched road and the parts do without; torch and torchrl import none of them either.
+HEAVY = "{'highway_env', 'pygame', 'matplotlib', 'pandas'}"
+LOADED = f"print(*sorted({HEAVY} & set(sys.modules)))"
+
+
+def test_the_batched_road_and_the_parts_stand_alone():
+    code = f"""
+import sys
+import saferl, saferl.envs, saferl.envs.transforms, saferl.modules, saferl.objectives
+from saferl.envs.intersection import BatchedIntersection, Scenario
+from saferl.envs.intersection.drivers import CautiousDriver
+env = BatchedIntersection(Scenario(scenario="dense"), num_envs=2)
+env.rollout(3, CautiousDriver())
+env.reset()
+{LOADED}
+"""
+    assert fresh(code) == ""
+
+
+def test_highway_env_comes_with_the_first_use_of_what_is_built_on_it():
+    named = "from saferl.envs.intersection import HighwayIntersection, IntersectionEnv"
+    made = "import gymnasium; gymnasium.make('saferl/Intersection-LT-v0').reset(seed=0)"
+    for use in (named, made):
+        loaded = fresh(f"import sys, saferl.envs; {LOADED}; {use}; {LOADED}")
+        assert loaded.split() == ["highway_env", "matplotlib", "pandas", "pygame"], use
+
+
+def test_the_packages_names_are_there_and_no_others():
+    package = importlib.import_module("saferl.envs.intersection")
+    assert set(package.__all__) <= set(dir(package))
+    assert all(hasattr(package, name) for name in package.__all__)
+    assert not hasattr(package, "Roundabout")

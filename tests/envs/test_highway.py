@@ -10,9 +10,9 @@ from gymnasium.utils.env_checker import check_env
 from numpy_routes import rectangles_overlap, routes
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
+from saferl.envs.intersection import IntersectionEnv, register
 from saferl.envs.intersection.dynamics import step_ego, to_physical
 from saferl.envs.intersection.geometry import TASKS
-from saferl.envs.intersection.highway import IntersectionEnv, register
 
 CHEAP = {"steps": 1}  # where the cost is not looked at
 STILL = np.array([-1.0, 0.0], np.float32)

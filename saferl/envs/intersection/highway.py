@@ -234,15 +234,3 @@ class IntersectionEnv(gymnasium.Env):
     def close(self) -> None:
         """Let go of the drawing surface."""
         self._renderer = None
-
-
-def register() -> None:
-    """Make ``saferl/Intersection-{LT,GS,RT,Mixed}-v0`` known to ``gymnasium.make``."""
-    for name, task in (("LT", "lt"), ("GS", "gs"), ("RT", "rt"), ("Mixed", "mixed")):
-        key = f"saferl/Intersection-{name}-v0"
-        if key not in gymnasium.registry:
-            gymnasium.register(
-                id=key,
-                entry_point="saferl.envs.intersection.highway:IntersectionEnv",
-                kwargs={"task": task},
-            )
