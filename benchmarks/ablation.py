@@ -24,7 +24,7 @@ from pathlib import Path
 
 from side_by_side import belongs, write
 
-from saferl.metrics import wilson
+from saferl.evaluation.statistics import wilson
 
 RATES = {"success": "success_rate", "collision": "collision_rate", "frozen": "frozen_rate"}
 

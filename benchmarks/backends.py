@@ -24,12 +24,12 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.transforms import Transform
 
-from saferl.checkpoint import run_config
-from saferl.commands import trained_policy
+from saferl.checkpoint.run import run_config
+from saferl.cli.evaluate import trained_policy
 from saferl.envs.intersection import BatchedIntersection, HighwayIntersection, Scenario
 from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver
-from saferl.evaluation import as_test, envs_at_once, evaluate
-from saferl.metrics import wilson
+from saferl.evaluation.play import envs_at_once, evaluate
+from saferl.evaluation.statistics import wilson
 
 DRIVERS = {"cautious": CautiousDriver, "blind": Driver, "random": RandomDriver}
 BACKENDS = {"batched": (BatchedIntersection, 100), "highway": (HighwayIntersection, 10)}
@@ -97,7 +97,7 @@ def main() -> None:
     for name, (policy, transforms, settings) in policies.items():
         total = dict.fromkeys(BACKENDS, 0)
         for task in options.tasks:
-            scenario = as_test(Scenario(task=task, **settings))
+            scenario = Scenario(task=task, **settings).as_test()
             rows = {b: rows_of(policy, transforms, scenario, b, n) for b in BACKENDS}
             same += sum(
                 all(a[rate] == b[rate] for rate in RATES)

@@ -10,17 +10,18 @@ the episode. Prints both means, how often each exceeds the run's cost limit, and
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 from pathlib import Path
 
 import hydra
 import torch
 
-from saferl.agents import load_agent
-from saferl.checkpoint import run_config
+from saferl.algorithms.assemble import load_agent
+from saferl.checkpoint.run import run_config
 from saferl.envs.intersection import BatchedIntersection
 from saferl.envs.seeding import episode_seeds
-from saferl.evaluation import as_test, play
+from saferl.evaluation.play import play
 
 
 @torch.no_grad()
@@ -30,7 +31,8 @@ def calibrate(run: Path, episodes: int, frequency: int) -> dict[str, float]:
     agent = load_agent(cfg, run, "checkpoint")
     if not hasattr(agent.loss, "cost_value"):
         raise SystemExit(f"{run}: algo={cfg.algo_name} has no cost critic.")
-    env = BatchedIntersection(as_test(hydra.utils.instantiate(cfg.task), frequency), episodes)
+    task = hydra.utils.instantiate(cfg.task).as_test()
+    env = BatchedIntersection(dataclasses.replace(task, policy_frequency=frequency), episodes)
     steps = play(agent.actor, env, episode_seeds(cfg.seed, episodes))
     alive = torch.stack([step["alive"] for step in steps])
     cost = torch.stack([step["next", "cost"].squeeze(-1) for step in steps]) * alive

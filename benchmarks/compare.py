@@ -14,7 +14,7 @@ import csv
 import json
 from pathlib import Path
 
-from saferl.metrics import mean_interval
+from saferl.evaluation.statistics import mean_interval
 
 #: What two tests must have alike; their backends and their number of vehicle rows may differ.
 ALIKE = ("task", "scenario", "traffic", "vehicles", "reading", "policy_frequency", "seed")

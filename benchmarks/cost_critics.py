@@ -21,8 +21,8 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import SoftUpdate
 
-from saferl.agents import load_agent
-from saferl.checkpoint import run_config
+from saferl.algorithms.assemble import load_agent
+from saferl.checkpoint.run import run_config
 from saferl.envs.intersection import BatchedIntersection
 from saferl.modules import DualAscent, MLPValue, MMAMValue, value_operator, zero_output
 from saferl.objectives import SACLagLoss
@@ -86,9 +86,9 @@ def main() -> None:
         )
         loss.make_value_estimator(gamma=cfg.gamma)
         optimizer = torch.optim.Adam(loss.cost_critic_params.parameters(), lr=1e-3, fused=True)
-        targets = SoftUpdate(loss, tau=cfg.tau)
+        targets = SoftUpdate(loss, tau=cfg.learning.tau)
         for update in range(1, options.updates + 1):
-            value, _ = loss.cost_loss(train[torch.randint(len(train), (cfg.batch_size,))])
+            value, _ = loss.cost_loss(train[torch.randint(len(train), (cfg.learning.batch_size,))])
             value.backward()
             optimizer.step()
             optimizer.zero_grad()

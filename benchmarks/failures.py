@@ -25,9 +25,8 @@ from cost_critics import followed
 from side_by_side import write
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from saferl.agents import load_agent
-from saferl.builders import build_env
-from saferl.checkpoint import run_config
+from saferl.algorithms.assemble import build_env, load_agent
+from saferl.checkpoint.run import run_config
 from saferl.envs.intersection.geometry import ARM, project, reference_lines
 from saferl.envs.intersection.observation import as_world
 from saferl.modules import CriticEnsemble
@@ -55,7 +54,7 @@ def main() -> None:
     cfg.device, cfg.task.route_starts, cfg.task.standstill = "cpu", 0.0, None
     agent = load_agent(cfg, options.run, "RUN")
     scenario = hydra.utils.instantiate(cfg.task)
-    env = build_env(cfg, scenario, options.episodes, options.seed)
+    env = build_env(cfg.env, scenario, options.episodes, options.seed)
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         data = env.rollout(scenario.horizon, agent.actor, break_when_any_done=False)
 
@@ -94,7 +93,7 @@ def main() -> None:
         )
         with torch.no_grad():
             values = critics.values(states).amin(0).flatten()
-        earned = after["reward"][stands, horizon, 0].mean().item() * cfg.reward_scale
+        earned = after["reward"][stands, horizon, 0].mean().item() * cfg.learning.reward_scale
         # A critic does not see for how long a car has stood: each decision may be the last of so many.
         worth = earned / (1 - cfg.gamma * (1 - 1 / patience))
         figures["value of standing"], figures["worth of standing"] = values.tolist(), worth

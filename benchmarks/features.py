@@ -19,7 +19,7 @@ from side_by_side import write
 from time_to_safe import ENDS, Work, carry_out, tests, train
 
 from saferl.envs.intersection.observation import FORMS
-from saferl.metrics import mean_interval
+from saferl.evaluation.statistics import mean_interval
 
 BLANK = 1e9
 #: Whose features, and which.

@@ -28,7 +28,7 @@ from typing import Any
 
 from side_by_side import write
 
-from saferl.metrics import CsvLog
+from saferl.training.records import CsvLog
 
 HERE = Path(__file__).parent
 
@@ -45,7 +45,7 @@ def parts(out: Path, device: str, small: bool) -> dict[str, tuple[float, list[st
         for width in (["16"] if small else ["64", "256"])
     }
     batches = ["8"] if small else ["1024", "8192"]
-    few = ["env.num_envs=16", "warmup_frames=64", "compile=false"] if small else []
+    few = ["env.num_envs=16", "learning.warmup_frames=64", "compile=false"] if small else []
     run = [f"device={device}", "logger=none", "save_minutes=null", "threads=1"]
     return {
         "simulation": (
@@ -68,7 +68,13 @@ def parts(out: Path, device: str, small: bool) -> dict[str, tuple[float, list[st
             10.0 if small else 80.0,
             [
                 *("-m", "saferl", "algo=arsac", "task=mixed", "episodes=10000"),
-                *("updates_per_frame=1", "env.num_envs=16", "record_every=500", *run, *few),
+                *(
+                    "learning.updates_per_frame=1",
+                    "env.num_envs=16",
+                    "record_every=500",
+                    *run,
+                    *few,
+                ),
                 f"out={out}/paper",
             ],
         ),

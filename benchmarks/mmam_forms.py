@@ -22,7 +22,7 @@ from torch.nn import functional as F
 
 from saferl.envs.intersection import BatchedIntersection, Scenario
 from saferl.envs.intersection.drivers import CautiousDriver, Driver
-from saferl.metrics import mean_interval
+from saferl.evaluation.statistics import mean_interval
 from saferl.modules import MMAMPolicyEncoder
 
 ENVS, DECISIONS, NOISE, BATCH = 256, 400, 0.2, 256

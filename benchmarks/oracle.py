@@ -23,7 +23,8 @@ from saferl.envs.intersection import BatchedIntersection, Scenario
 from saferl.envs.intersection.drivers import Driver
 from saferl.envs.intersection.yielding import STOP
 from saferl.envs.seeding import episode_seeds
-from saferl.evaluation import as_test, episode_rows, play
+from saferl.evaluation.play import play
+from saferl.evaluation.rows import episode_rows
 
 SPEEDS = (8.0, 12.0, 5.0, 3.0)  # m/s
 WAITS = (2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0, 16.0, 18.0)  # s from the start
@@ -50,7 +51,7 @@ class Plan(Driver):
 def arrives(scenario: Scenario, seeds: Tensor, plan: tuple[float, float]) -> Tensor:
     """Which of the episodes a plan solves [B]."""
     env = BatchedIntersection(scenario, len(seeds), 0)
-    rows = episode_rows(play(Plan(*plan, scenario.policy_frequency), env, seeds), seeds)
+    rows = episode_rows(play(Plan(*plan, scenario.policy_frequency), env, seeds), seeds, scenario)
     return torch.tensor([bool(row["success"]) for row in rows])
 
 
@@ -69,7 +70,7 @@ def main() -> None:
         "| | the first plan % | any plan % | plans that solve an episode, quartiles |\n|---|---|---|---|"
     )
     for task in ("lt", "gs", "rt"):
-        scenario = as_test(Scenario(task=task))
+        scenario = Scenario(task=task).as_test()
         seeds = episode_seeds(options.seed, options.episodes)
         solved = first = arrives(scenario, seeds, PLANS[0])
         for plan in PLANS[1:]:

@@ -21,10 +21,9 @@ from torchrl.checkpoint import Checkpoint
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from saferl.agents import load_agent
-from saferl.checkpoint import latest
-from saferl.commands import run_config
-from saferl.components import BufferState
+from saferl.algorithms.assemble import load_agent
+from saferl.checkpoint.run import latest, run_config
+from saferl.checkpoint.state import BufferState
 from saferl.envs.intersection import CollisionCost
 from saferl.envs.intersection.dynamics import step_ego, to_physical
 from saferl.envs.intersection.geometry import offroad
@@ -68,7 +67,7 @@ def main() -> None:
     cfg.device = "cpu"
     agent = load_agent(cfg, args.run, "run")
     buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(cfg.buffer_size), generator=torch.Generator()
+        storage=LazyTensorStorage(cfg.learning.buffer_size), generator=torch.Generator()
     )
     Checkpoint(buffer=BufferState(buffer)).load(latest(args.run))
     index = torch.randperm(len(buffer))[: args.samples]

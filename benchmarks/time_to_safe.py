@@ -39,12 +39,13 @@ import torch
 from hydra import compose, initialize_config_dir
 from side_by_side import belongs, write
 
-from saferl.agents import make
-from saferl.builders import build_env, build_trainer
-from saferl.commands import claim, compiling
+from saferl.algorithms.assemble import build_env, build_trainer
+from saferl.algorithms.base import make
+from saferl.cli.evaluate import compiling
+from saferl.cli.train import claim
+from saferl.config.locate import config_dir
 from saferl.envs.transforms import SafetyProjector
-from saferl.evaluation import as_test, evaluate
-from saferl.paths import config_dir
+from saferl.evaluation.play import evaluate
 
 MARKS = (0.90, 0.95, 0.979)
 TASKS = ("lt", "gs", "rt")
@@ -71,8 +72,8 @@ def test(cfg: Any, trainer: Any, projector: list, episodes: int) -> dict[str, fl
     cfg = compiling(cfg, False)
     figures: dict[str, float] = {}
     for task in TASKS:
-        one = as_test(dataclasses.replace(scenario, task=task))
-        env = build_env(cfg, one, min(episodes, 250), 0, *projector)
+        one = dataclasses.replace(scenario, task=task).as_test()
+        env = build_env(cfg.env, one, min(episodes, 250), 0, transforms=projector)
         rows = evaluate(trainer.collector.policy, env, episodes, seed=0, progress=False)
         for transform in projector:
             transform.reset_parent()  # for the next environment

@@ -32,9 +32,9 @@ from pathlib import Path
 from hydra import compose, initialize_config_dir
 from side_by_side import write
 
-from saferl.builders import build_trainer
-from saferl.commands import claim
-from saferl.paths import config_dir
+from saferl.algorithms.assemble import build_trainer
+from saferl.cli.train import claim
+from saferl.config.locate import config_dir
 
 PHASES = ("simulate", "act", "project", "learn", "other")
 
@@ -97,7 +97,7 @@ def train(overrides: list[str], out: Path | None) -> dict:
         "frames": trainer.progress.frames,
         "episodes": trainer.progress.episodes,
         "updates": trainer.progress.updates,
-        "updates_per_frame": cfg.updates_per_frame,
+        "updates_per_frame": cfg.learning.updates_per_frame,
         "success": trainer.window.summary()["success_rate"],
         "seconds": watch.seconds,
         "share": {name: seconds / wall for name, seconds in watch.seconds.items()},

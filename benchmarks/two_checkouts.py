@@ -22,15 +22,28 @@ from typing import Any
 from side_by_side import conditions, medians, parser, rate, write
 
 
+def learner_of(cfg: Any) -> Any:
+    """What makes an update, by this or an older checkout."""
+    try:
+        from saferl.algorithms.assemble import algorithm_of, build_agent
+    except ImportError:
+        from saferl.agents import build_agent
+        from saferl.builders import build_learner
+
+        return build_learner(cfg, build_agent(cfg).loss)
+    return algorithm_of(cfg).learner(build_agent(cfg).loss, cfg.compile)
+
+
 def serve(overrides: list[str], options: Any) -> None:
     """The child: gets ready, says so, and answers each line, a number of seconds, with a rate."""
     import torch
     from hydra import compose, initialize_config_dir
     from update import transitions
 
-    from saferl.agents import build_agent
-    from saferl.builders import build_learner
-    from saferl.paths import config_dir
+    try:
+        from saferl.config.locate import config_dir
+    except ImportError:  # an older commit
+        from saferl.paths import config_dir
 
     torch.set_num_threads(options.threads)
     device, compiled = options.device, options.modes == ["compiled"]
@@ -40,7 +53,7 @@ def serve(overrides: list[str], options: Any) -> None:
         if "observation" in cfg.task:  # older commits have no other than the world's
             cfg = compose("config", [*overrides, "task.observation=world"])
     torch.manual_seed(0)
-    learner, data = build_learner(cfg, build_agent(cfg).loss), transitions(options.batch, device)
+    learner, data = learner_of(cfg), transitions(options.batch, device)
 
     def work() -> int:
         learner.update(data)

@@ -35,10 +35,9 @@ from tensordict import TensorDict
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
-from saferl.agents import build_agent
-from saferl.builders import build_learner
-from saferl.learner import Learner
-from saferl.paths import config_dir
+from saferl.algorithms.assemble import algorithm_of, build_agent
+from saferl.config.locate import config_dir
+from saferl.training.learner import Learner
 
 ROWS = 11
 PLAIN = [
@@ -100,7 +99,7 @@ def learner(overrides: list[str], device: str, compile: bool) -> Learner:
         fixed = ["task.observation=world", f"device={device}", f"compile={compile}"]
         cfg = compose("config", [*overrides, *fixed])
     torch.manual_seed(0)
-    return build_learner(cfg, build_agent(cfg).loss)
+    return algorithm_of(cfg).learner(build_agent(cfg).loss, cfg.compile)
 
 
 def main() -> None:

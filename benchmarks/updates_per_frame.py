@@ -22,7 +22,7 @@ from pathlib import Path
 from matplotlib import pyplot as plt
 from side_by_side import belongs, write
 
-from saferl.metrics import CsvLog
+from saferl.training.records import CsvLog
 
 #: Of the short run: frames before the first update, and updates.
 WARMUP, UPDATES = 2000, 600
@@ -77,7 +77,7 @@ def main() -> None:
     for number, value in enumerate(options.values):
         # By default the long runs alone would compile, which the short one says nothing about.
         common = [f"algo={options.algo}", f"task={options.task}", "compile=false"]
-        common += [f"updates_per_frame={value}", *options.set]
+        common += [f"learning.updates_per_frame={value}", *options.set]
         trial = options.out / f"trial_{value}"
         train(trial, WARMUP + int(UPDATES / value), [*common, "evaluation.episodes=1"])
         frames = frames_in(trial, options.minutes)

@@ -21,8 +21,8 @@ from torchrl.envs import TransformedEnv
 import saferl.envs  # registers the environments  # noqa: F401
 from saferl.envs.intersection import BatchedIntersection, Scenario
 from saferl.envs.transforms import SafetyProjector
-from saferl.evaluation import as_test, evaluate
-from saferl.metrics import summarise, table
+from saferl.evaluation.play import evaluate
+from saferl.evaluation.statistics import summarise, table
 from saferl.modules import CriticEnsemble, MLPValue, value_operator, zero_output
 
 GAMMA, LIMIT = 0.99, 0.05
@@ -83,7 +83,7 @@ for _ in range(options.updates):
     target.data.lerp_(risk.params.data, 0.005)
 
 for name, transforms in (("alone", []), ("with the projector", [SafetyProjector(risk, LIMIT)])):
-    env = BatchedIntersection(as_test(scenario), num_envs=min(100, options.episodes))
+    env = BatchedIntersection(scenario.as_test(), num_envs=min(100, options.episodes))
     env = TransformedEnv(env, *transforms) if transforms else env
     rows = evaluate(policy, env, options.episodes, seed=0, progress=False)
     print(table(summarise(rows), f"\nPPO of Stable-Baselines3, {name}"))

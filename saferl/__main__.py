@@ -1,6 +1,6 @@
 """Train: ``python -m saferl algo=arsac task=gs``."""
 
-from saferl.cli import launch
+from saferl.cli.launch import launch
 
 if __name__ == "__main__":
     launch("train", "config")

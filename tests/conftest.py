@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from small import fitting
 
-from saferl.cli import launch
+from saferl.cli.launch import launch
 
 torch.set_num_threads(1)
 
@@ -21,7 +22,7 @@ def command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.chdir(tmp_path)
 
     def run(name: str, config: str, *arguments: str) -> None:
-        monkeypatch.setattr(sys, "argv", ["saferl", *arguments])
+        monkeypatch.setattr(sys, "argv", ["saferl", *fitting(arguments)])
         launch(name, config)
 
     return run
@@ -49,7 +50,7 @@ def spawn(tmp_path: Path):
     def start(module: str, *arguments: str) -> subprocess.Popen:
         processes.append(
             subprocess.Popen(
-                [sys.executable, "-m", module, *arguments],
+                [sys.executable, "-m", module, *fitting(arguments)],
                 cwd=tmp_path,
                 env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"},
                 stdout=subprocess.PIPE,

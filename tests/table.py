@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
 
 from saferl.envs.seeding import SeededEnv, uniform
+from saferl.envs.task import Task
 
 #: By state: the cost of full action, and how strongly the reward pulls beyond the limit.
 PRICES = (0.5, 0.7, 0.9, 1.1)
@@ -16,7 +17,7 @@ PULLS = (0.95, 1.0, 1.05, 1.0)
 
 
 @dataclass(frozen=True)
-class Table:
+class Table(Task):
     """Four states, drawn anew at each step; r = -(a - g_s)^2 and c = u_s (1 + a) / 2, a in [-1, 1].
 
     Q_c(s, a) = c(s, a) + gamma V, where V is the mean cost over the states / (1 - gamma). With the limit d on
@@ -58,9 +59,8 @@ class TableEnv(SeededEnv):
 
     kept = (*SeededEnv.kept, "_seeds", "_steps", "_where")
 
-    def __init__(self, scenario: Table, num_envs: int = 1, seed: int = 0, device=None):
-        super().__init__(num_envs, device)
-        self.scenario = scenario
+    def __init__(self, task: Table, num_envs: int = 1, seed: int = 0, device=None):
+        super().__init__(task, num_envs, device)
         batch = self.batch_size
         self.observation_spec = Composite(observation=Unbounded(shape=(*batch, 4)), shape=batch)
         self.action_spec = Bounded(-1.0, 1.0, shape=(*batch, 1))
@@ -80,14 +80,14 @@ class TableEnv(SeededEnv):
         return TensorDict({"observation": self._observe()}, batch_size=self.batch_size)
 
     def _step(self, tensordict):
-        action, scenario = tensordict["action"], self.scenario
+        action, task = tensordict["action"], self.task
         here = torch.nn.functional.one_hot(self._where, 4).bool()
         reward, cost = (
             value.expand(*self.batch_size, 4)[here].unsqueeze(-1)
-            for value in (scenario.reward(action), scenario.prices * (1 + action) / 2)
+            for value in (task.reward(action), task.prices * (1 + action) / 2)
         )
         self._steps = self._steps + 1
-        done = (self._steps >= scenario.horizon)[:, None]
+        done = (self._steps >= task.horizon)[:, None]
         return TensorDict(
             {
                 "observation": self._observe(),

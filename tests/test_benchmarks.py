@@ -10,7 +10,12 @@ import pytest
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
-FAST = ["encoder.policy.width=16", "warmup_frames=64", "batch_size=16", "compile=false"]
+FAST = [
+    "encoder.policy.width=16",
+    "learning.warmup_frames=64",
+    "learning.batch_size=16",
+    "compile=false",
+]
 SHORT = ["--rounds", "1", "--seconds", "0.1"]
 ABLATION = ["--runs", "algo=sac", "--seeds", "0", "--tasks", "gs", "--episodes", "5", "--jobs", "1"]
 

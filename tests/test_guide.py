@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from small import SMALL
+from small import SMALL, fitting
 
 GUIDE = (Path(__file__).parents[1] / "docs/guide.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```(\w+)\n(.*?)```", GUIDE, re.DOTALL)
@@ -32,18 +32,18 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_guide_has_its_parts():
-    assert len(COMMANDS) == 5 and BUILT_IN in GUIDE
+    assert len(COMMANDS) == 6 and BUILT_IN in GUIDE
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_command_of_the_guide(command: str, project: Path):
     small = [o for o in SMALL if not o.startswith("frames=") or "frames=" not in command]
     arguments = [*command.split()[3:], *small, "frames=16", "task.vehicles=2"]
-    if "task=gym" in command:
+    if "task=gym" in command or "task=tank" in command:
         arguments.remove("task.vehicles=2")
     paths = os.pathsep.join([str(project), *filter(None, [os.environ.get("PYTHONPATH")])])
     done = subprocess.run(
-        [sys.executable, "-m", "saferl", *arguments],
+        [sys.executable, "-m", "saferl", *fitting(arguments)],
         cwd=project,
         env={**os.environ, "PYTHONPATH": paths},
         capture_output=True,
@@ -58,7 +58,12 @@ def test_algorithm_of_the_examples(project: Path):
     options = [o for o in SMALL if not o.startswith(("frames=", "episodes="))]
     arguments = BUILT_IN.replace("examples", f"{root}/examples").split()[3:]
     done = subprocess.run(
-        [sys.executable, "-m", "saferl", *arguments, *options, "frames=16", "task.vehicles=0"],
+        [
+            sys.executable,
+            "-m",
+            "saferl",
+            *fitting([*arguments, *options, "frames=16", "task.vehicles=0"]),
+        ],
         cwd=project,
         capture_output=True,
         text=True,

@@ -12,10 +12,10 @@ from table import Table
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from saferl.builders import build_trainer
+from saferl.algorithms.assemble import build_trainer
 from saferl.envs import Cart, CartEnv
 from saferl.envs.seeding import episode_seeds
-from saferl.evaluation import play
+from saferl.evaluation.play import play
 
 QUIET = ("logger=none", "threads=1", "save_minutes=null", "save_every=100000000", "device=cpu")
 LIMIT, GAMMA, FOREVER = 0.2, 0.9, 80
@@ -39,11 +39,11 @@ def sums(policy, steps: int, gamma: float) -> tuple[float, float]:
 
 #: The problem that each states: discount of the cost in its limit, and over how many decisions.
 PROBLEMS = {
-    "cpo": (GAMMA, 20, ("loss.damping=0.01", "rollout_frames=2560", "frames=800000")),
+    "cpo": (GAMMA, 20, ("loss.damping=0.01", "learning.rollout_frames=2560", "frames=800000")),
     "ppo_lag": (
         1.0,
         20,
-        (f"lagrange.signal.cost_limit={LIMIT}", "experience.epochs=5", "loss.entropy_bonus=false"),
+        (f"lagrange.signal.cost_limit={LIMIT}", "learning.epochs=5", "loss.entropy_bonus=false"),
     ),
     "sac_lag": (1.0, 20, (f"lagrange.signal.cost_limit={LIMIT}",)),
 }
@@ -70,10 +70,10 @@ def test_cart(algo: str, seed: int, tmp_path: Path):
 
 
 TABLE = (
-    "encoder=mlp", "task=cart", "~task.spread", "~task.noise", "task._target_=table.Table", "task.task=table", "task.size=4",
+    "encoder=mlp", "task=cart", "~task.spread", "~task.noise", "task._target_=table.Table", "task.task=table",
     "task.horizon=10", "env._target_=table.TableEnv", "env.num_envs=64", "cost_limit=1",
-    "gamma=0.8", "tau=0.005", "frames=200000", "updates_per_frame=0.04", "encoder.policy.width=32",
-    "encoder.policy.depth=2", "reward_scale=1", "target_entropy=-3", "compile=false",
+    "gamma=0.8", "learning.tau=0.005", "frames=200000", "learning.updates_per_frame=0.04", "encoder.policy.width=32",
+    "encoder.policy.depth=2", "learning.reward_scale=1", "learning.target_entropy=-3", "compile=false",
     "projector.penalty=10", "projector.step_size=0.005", "lagrange.multiplier.lr=0.003",
     "lagrange.multiplier.init=0",
 )  # fmt: skip

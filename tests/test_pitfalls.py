@@ -12,11 +12,11 @@ from tensordict.nn import TensorDictModule
 from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
 from torchrl.envs import TransformedEnv
 
-from saferl.builders import build_trainer
+from saferl.algorithms.assemble import build_trainer
 from saferl.envs import Cart, CartEnv
 from saferl.envs.transforms import SafetyProjector
-from saferl.experience import Epochs
 from saferl.modules import MLPPolicyEncoder, tanh_gaussian_actor
+from saferl.training.experience import Epochs
 
 ROOT = Path(__file__).parents[1]
 NAMED = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", (ROOT / "docs/pitfalls.md").read_text())
@@ -35,7 +35,7 @@ def test_named_test_exists(file: str, name: str):
 @pytest.mark.parametrize("algo", ["sac_lag", "ppo_lag", "cpo"])
 def test_costs_are_stored_as_they_are(algo: str, tmp_path: Path):
     """Where there is none, the critics learn from 0; the reward alone is scaled."""
-    options = (*SMALL, f"algo={algo}", "task=cart", "reward_scale=0.5", "frames=16")
+    options = (*SMALL, f"algo={algo}", "task=cart", "learning.reward_scale=0.5", "frames=16")
     trainer = build_trainer(compose(*options), tmp_path)
     data = next(iter(trainer.collector))
     batches = list(trainer.experience.batches(data, frames=8))

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Composite, Unbounded
 
 from saferl.envs.seeding import SeededEnv, uniform
+from saferl.envs.task import Task
 
 _A = np.array([[0.8, 0.3], [0.0, 0.8]])
 _B = np.array([[0.0], [0.5]])
@@ -22,7 +24,7 @@ _Q = np.diag([1.0, 0.1])
 
 
 @dataclass(frozen=True)
-class Cart:
+class Cart(Task):
     """A cart that a bounded force brings to the middle: a constrained linear-quadratic problem.
 
     With x = [position, velocity] and u the action: x' = A x + B u + w, reward -x Q x, cost u^2.
@@ -32,7 +34,7 @@ class Cart:
     Attributes:
         horizon: decisions of an episode.
         spread, noise: see above.
-        size, action_dim, task: of the observation, of the action, and what runs are called.
+        task: what runs are called.
 
     Raises:
         ValueError: a setting is out of range.
@@ -41,17 +43,15 @@ class Cart:
     horizon: int = 20
     spread: float = 1.0
     noise: float = 0.1
-    size: int = 2
-    action_dim: int = 1
     task: str = "cart"
+
+    size: ClassVar[int] = 2
+    action_dim: ClassVar[int] = 1
 
     def __post_init__(self):
         for name, least in (("horizon", 1), ("spread", 0), ("noise", 0)):
             if not getattr(self, name) >= least:
                 raise ValueError(f"task.{name} must be >= {least}, got {getattr(self, name)}.")
-        for name, value in (("size", 2), ("action_dim", 1)):
-            if getattr(self, name) != value:
-                raise ValueError(f"task.{name} is {value} of a cart, got {getattr(self, name)}.")
 
     def sums(
         self, gain: np.ndarray, gamma: float, horizon: float = math.inf
@@ -110,7 +110,7 @@ class CartEnv(SeededEnv):
     """:class:`Cart` as a batch of tensors.
 
     Args:
-        scenario: the task.
+        task: its settings.
         num_envs: B.
         seed: of the sequences of episodes.
         device: of the tensors.
@@ -123,9 +123,8 @@ class CartEnv(SeededEnv):
 
     kept = (*SeededEnv.kept, "_seeds", "_steps", "_state")
 
-    def __init__(self, scenario: Cart, num_envs: int = 1, seed: int = 0, device=None):
-        super().__init__(num_envs, device)
-        self.scenario = scenario
+    def __init__(self, task: Cart, num_envs: int = 1, seed: int = 0, device=None):
+        super().__init__(task, num_envs, device)
         batch = self.batch_size
         self.observation_spec = Composite(observation=Unbounded(shape=(*batch, 2)), shape=batch)
         self.action_spec = Bounded(-1.0, 1.0, shape=(*batch, 1))
@@ -143,7 +142,7 @@ class CartEnv(SeededEnv):
         self._seeds = torch.where(reset, self._next_seeds(tensordict, reset), self._seeds)
         self._steps = torch.where(reset, 0, self._steps)
         drawn = torch.stack([uniform(self._seeds, stream) for stream in (0, 1)], -1)
-        start = ((2 * drawn - 1) * self.scenario.spread).to(self._state)
+        start = ((2 * drawn - 1) * self.task.spread).to(self._state)
         self._state = torch.where(reset[:, None], start, self._state)
         return TensorDict(
             {"observation": self._state.clone()}, batch_size=self.batch_size, device=self.device
@@ -153,11 +152,11 @@ class CartEnv(SeededEnv):
         action = tensordict.get("action").clamp(-1.0, 1.0)
         state, (A, B) = self._state, self._matrices
         reward = -(state.square() @ state.new_tensor(np.diag(_Q)).unsqueeze(-1))
-        shock = (2 * uniform(self._seeds + (self._steps << 32), 2) - 1) * self.scenario.noise
+        shock = (2 * uniform(self._seeds + (self._steps << 32), 2) - 1) * self.task.noise
         self._state = state @ A.T + action @ B.T
         self._state[:, 1] += shock.to(state)
         self._steps = self._steps + 1
-        done = (self._steps >= self.scenario.horizon)[:, None]
+        done = (self._steps >= self.task.horizon)[:, None]
         return TensorDict(
             {
                 "observation": self._state.clone(),

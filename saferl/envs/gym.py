@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,10 +18,11 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Composite, Unbounded
 
 from saferl.envs.seeding import ReplayedEnv
+from saferl.envs.task import Task
 
 
 @dataclass(frozen=True)
-class GymTask:
+class GymTask(Task):
     """A registered gymnasium environment, with continuous actions, whose ``info`` tells the cost of a step.
 
     Attributes:
@@ -73,7 +75,7 @@ class GymTask:
             )
         return env
 
-    def complete(self) -> dict[str, int]:
+    def complete(self) -> Mapping[str, int]:
         """What is left open of ``size``, ``action_dim`` and ``horizon``, from the environment itself, of
         which one step is tried.
 
@@ -105,7 +107,7 @@ class GymEnvs(ReplayedEnv):
     A run continues exactly after a resume where an episode follows from its seed and its actions.
 
     Args:
-        scenario: which environment.
+        task: which environment.
         num_envs: B.
         seed: of the sequences of episodes.
         device: of the tensors.
@@ -122,10 +124,9 @@ class GymEnvs(ReplayedEnv):
     torch.Size([2, 3, 1])
     """
 
-    def __init__(self, scenario: GymTask, num_envs: int = 1, seed: int = 0, device=None):
-        super().__init__(num_envs, device)
-        self.scenario = scenario
-        batch, facts = self.batch_size, scenario.complete()
+    def __init__(self, task: GymTask, num_envs: int = 1, seed: int = 0, device=None):
+        super().__init__(task, num_envs, device)
+        batch, facts = self.batch_size, task.complete()
         self.horizon = facts["horizon"]
         self.observation_spec = Composite(
             observation=Unbounded(shape=(*batch, facts["size"])), shape=batch
@@ -137,9 +138,9 @@ class GymEnvs(ReplayedEnv):
         self.set_seed(seed)
 
     def _make(self) -> gymnasium.Env:
-        env = self.scenario.make()
+        env = self.task.make()
         ones = np.ones(env.action_space.shape, np.float32)  # pyright: ignore
-        env = _Cost(env, self.scenario.cost_key)
+        env = _Cost(env, self.task.cost_key)
         return FlattenObservation(RescaleAction(env, -ones, ones))
 
     def _stack(self, ended: bool) -> TensorDict:
@@ -155,7 +156,7 @@ class GymEnvs(ReplayedEnv):
         found = {key: np.array(value, np.float32) for key, value in values.items()}
         for key, value in found.items():
             if not np.isfinite(value).all():
-                raise ValueError(f"task.id: {self.scenario.id} gave {key}={value}.")
+                raise ValueError(f"task.id: {self.task.id} gave {key}={value}.")
         return found
 
     def _start(self, index: int, seed: int) -> dict[str, Any]:

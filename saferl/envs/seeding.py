@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
+
+from saferl.envs.task import Task
 
 _MIX = (-7046029254386353131, -4658895280553007687, -7723592293110705685)
 U31 = 0x7FFFFFFF
@@ -50,10 +52,12 @@ class SeededEnv(EnvBase):
     environment goes on in its own sequence, which follows from ``set_seed``.
 
     Args:
+        task: its settings.
         num_envs: B.
         device: of the tensors.
 
     Attributes:
+        task: as given.
         kept: names of the tensors that are its state.
 
     Raises:
@@ -62,10 +66,11 @@ class SeededEnv(EnvBase):
 
     kept: tuple[str, ...] = ("_stream", "_episode")
 
-    def __init__(self, num_envs: int, device=None):
+    def __init__(self, task: Task, num_envs: int, device=None):
         if num_envs < 1:
             raise ValueError(f"num_envs must be >= 1, got {num_envs}.")
         super().__init__(device=device, batch_size=[num_envs])  # pyright: ignore[reportArgumentType]
+        self.task: Any = task
 
     def _make_ends(self) -> None:
         """The specs of reward, cost and the ends of episodes."""
@@ -105,6 +110,22 @@ class SeededEnv(EnvBase):
         for name in self.kept:
             value = state_dict[name.lstrip("_")]
             setattr(self, name, value.to(self.device or "cpu").clone())
+
+
+def start(env: EnvBase, seeds: Tensor) -> TensorDictBase:
+    """Reset an environment, with or without transforms, to the episodes of these seeds.
+
+    TorchRL's ``TransformedEnv.reset`` keeps every key but the environment's state from it, so a
+    ``seed`` must reach the environment itself.
+
+    Args:
+        env: batch size [B].
+        seeds: int64 [B].
+    """
+    request = TensorDict({"seed": seeds}, batch_size=env.batch_size)
+    if not isinstance(env, TransformedEnv):
+        return env.reset(request)
+    return env.transform._reset(request.empty(), env.base_env.reset(request))
 
 
 class ReplayedEnv(SeededEnv):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from saferl.compiling import Compiled
+from saferl.modules.compiled import Compiled
 from saferl.modules.critics import BoundCritics
 
 #: Steps between two looks at whether any sample still moves, in compiled code.

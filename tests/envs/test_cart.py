@@ -66,7 +66,6 @@ def test_specs_and_episodes():
         ({"horizon": 0}, "task.horizon must be >= 1, got 0"),
         ({"spread": -1.0}, "task.spread must be >= 0, got -1"),
         ({"noise": float("nan")}, "task.noise must be >= 0, got nan"),
-        ({"action_dim": 2}, "task.action_dim is 1 of a cart, got 2"),
     ],
 )
 def test_refuses(setting: dict, message: str):

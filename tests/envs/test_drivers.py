@@ -8,10 +8,11 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from saferl import evaluation
 from saferl.envs.intersection import BatchedIntersection, Scenario
 from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver
 from saferl.envs.intersection.geometry import ROUTES
+from saferl.evaluation import play as playing
+from saferl.evaluation.rows import episode_rows
 
 NORTH = -math.pi / 2
 
@@ -157,12 +158,14 @@ def test_random_driver_draws_from_no_generator():
 def test_a_random_episode_is_the_same_alone_and_in_a_batch():
     scenario = Scenario(task="mixed", vehicles=4)
     seeds = torch.arange(5)
-    rows = evaluation.episode_rows(
-        evaluation.play(RandomDriver(), BatchedIntersection(scenario, num_envs=5), seeds), seeds
+    rows = episode_rows(
+        playing.play(RandomDriver(), BatchedIntersection(scenario, num_envs=5), seeds),
+        seeds,
+        scenario,
     )
     for seed, row in zip(seeds.split(1), rows, strict=True):
         env = BatchedIntersection(scenario, num_envs=1)
-        (alone,) = evaluation.episode_rows(evaluation.play(RandomDriver(), env, seed), seed)
+        (alone,) = episode_rows(playing.play(RandomDriver(), env, seed), seed, scenario)
         assert alone.pop("route") == row.pop("route")
         assert alone == pytest.approx(row, rel=1e-5)
 

@@ -9,11 +9,11 @@ import hydra
 import pytest
 from small import compose
 
-from saferl.builders import build_env, build_trainer
+from saferl.algorithms.assemble import build_env, build_trainer
 from saferl.envs import GymEnvs, GymTask
 from saferl.envs.speed import RUNNERS, SpeedLimit
-from saferl.evaluation import evaluate
-from saferl.metrics import summarise
+from saferl.evaluation.play import evaluate
+from saferl.evaluation.statistics import summarise
 
 
 class Runner(gymnasium.Env):
@@ -71,7 +71,7 @@ def test_the_cost_falls_to_the_limit(tmp_path: Path):
         trainer = build_trainer(cfg, tmp_path / algo)
         trainer.train()
         task = hydra.utils.instantiate(cfg.task)
-        rows = evaluate(trainer.collector.policy, build_env(cfg, task, 10, 0), 20, 0)
+        rows = evaluate(trainer.collector.policy, build_env(cfg.env, task, 10, 0), 20, 0)
         figures = summarise(rows)
         cost[algo] = figures["cost_return"]
         for name in ("cost_return", "return"):

@@ -5,23 +5,29 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
 
 from saferl.envs.intersection.cost import CollisionCost
+from saferl.envs.intersection.drivers import DRIVERS
 from saferl.envs.intersection.geometry import ROUTES, ROUTES_OF_TASK
-from saferl.envs.intersection.observation import FORMS, ROWS, Form
+from saferl.envs.intersection.observation import FORMS, ROWS, Form, reading
 from saferl.envs.intersection.reward import Reward
 from saferl.envs.intersection.spawning import SCENARIOS, Traffic
 from saferl.envs.intersection.yielding import PERIOD
 from saferl.envs.seeding import SeededEnv
+from saferl.envs.task import Task
 
 SUBSTEPS = 3
 STANDING = 0.3  # m/s, slower counts as standing still
@@ -52,7 +58,7 @@ speed, destination_scale, weights, energy, smoothness.
 
 
 @dataclass(frozen=True)
-class Scenario:
+class Scenario(Task):
     """Settings of the driving task, the same for every backend.
 
     Attributes:
@@ -63,6 +69,7 @@ class Scenario:
         scenario: the traffic: a name in :data:`SCENARIOS`.
         traffic: a :class:`Traffic`, or a mapping of what differs from the scenario's.
         policy_frequency: decisions per second; each is integrated in 3 substeps.
+        test_frequency: decisions per second in a test.
         duration: seconds until ``truncated``.
         route_starts: fraction of the starts drawn uniformly along the route instead of 40 m before
             the box (training only).
@@ -84,6 +91,7 @@ class Scenario:
     rows: int = ROWS
     observation: str = "route"
     policy_frequency: int = 5
+    test_frequency: int = 10
     duration: float = 25.0
     route_starts: float = 0.0
     standstill: float | None = None
@@ -101,8 +109,9 @@ class Scenario:
             raise ValueError(
                 f"observation must be one of {', '.join(FORMS)}, got {self.observation!r}."
             )
-        if self.policy_frequency <= 0:
-            raise ValueError(f"policy_frequency must be > 0, got {self.policy_frequency}.")
+        for name in ("policy_frequency", "test_frequency"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"{name} must be > 0, got {getattr(self, name)}.")
         if not 0 < self.duration < float("inf") or self.horizon < 1:
             raise ValueError(
                 f"duration must be at least a decision, {1 / self.policy_frequency} seconds, "
@@ -125,6 +134,89 @@ class Scenario:
         object.__setattr__(self, "traffic", traffic)
         if self.standstill is not None and self.standstill <= 0:
             raise ValueError(f"standstill must be null or > 0 seconds, got {self.standstill}.")
+
+    drivers: ClassVar[Mapping[str, Callable[[int], TensorDictModuleBase]]] = DRIVERS
+    demonstrators: ClassVar[Sequence[str]] = ("scripted", "blind")
+    pictures: ClassVar[bool] = True
+    action_dim: ClassVar[int] = 2
+
+    @property
+    def in_tests(self) -> Mapping[str, Any]:
+        """Every start before the box, cars that stand left to themselves, the reward without r_safe, which is the
+        same for every algorithm, and decisions at ``test_frequency``."""
+        changes = {"route_starts": 0.0, "standstill": None, "reward": {"risk_shaping": False}}
+        return changes | {"policy_frequency": self.test_frequency}
+
+    @property
+    def observed(self) -> Mapping[str, tuple[int, ...]]:
+        vehicles = (self.rows, len(self.form.vehicle))
+        return {"ego": (len(self.form.ego),), "vehicles": vehicles, "route": (1,)}
+
+    @property
+    def network(self) -> Mapping[str, Any]:
+        return {"action_dim": self.action_dim, "rows": self.rows, **self.form.scales}
+
+    @property
+    def title(self) -> str:
+        return f"{self.task}, {self.traffic.vehicles[1]} vehicles"
+
+    def check_policy_of(self, trained: Scenario) -> None:
+        if trained.observation != self.observation:
+            raise ValueError(
+                f"task.observation must be {trained.observation}, by which this policy was trained, "
+                f"got {self.observation}."
+            )
+
+    def outcomes(self, last: TensorDictBase) -> Mapping[str, Tensor]:
+        """A ``collision`` is with a vehicle or off the road; whoever neither collides nor arrives is ``frozen``."""
+        collision = (last["collision"] | last["offroad"]).squeeze(-1).float()
+        success = last["success"].squeeze(-1).float()
+        return {"collision": collision, "success": success, "frozen": 1.0 - collision - success}
+
+    def figures(self, steps: Sequence[TensorDictBase], counts: Sequence[int]) -> list[dict]:
+        """``hit_vehicle`` and ``left_road`` tell collisions apart; ``speed`` (m/s) and ``min_distance`` (m, to another
+        vehicle) are over the whole episode."""
+        ego = torch.stack([step["next", "ego"] for step in steps]).to("cpu", torch.float64)
+        speed = torch.hypot(reading(ego, "v_x"), reading(ego, "v_y"))
+        distance = reading(ego, "d_veh")
+        ends = {
+            key: torch.stack([step["next", key].squeeze(-1) for step in steps]).cpu()
+            for key in ("collision", "offroad", "success")
+        }
+        routes = steps[0].get("route").flatten().tolist()
+        rows = []
+        for index, count in enumerate(counts):
+            hit, left, success = (bool(end[count - 1, index]) for end in ends.values())
+            rows.append(
+                {
+                    "route": ROUTES[routes[index]],
+                    "collision": int(hit or left),
+                    "success": int(success),
+                    "frozen": int(not (hit or left or success)),
+                    "hit_vehicle": int(hit),
+                    "left_road": int(left),
+                    "speed": math.fsum(speed[:count, index].tolist()) / count,
+                    "min_distance": distance[:count, index].min().item(),
+                }
+            )
+        return rows
+
+    def describe(self) -> dict[str, Any]:
+        return {
+            "task": self.task,
+            "vehicles": self.traffic.vehicles[1],
+            "rows": self.rows,
+            "scenario": self.scenario,
+            "traffic": dataclasses.asdict(self.traffic),
+            "reading": self.reward.reading,
+            "policy_frequency": self.policy_frequency,
+        }
+
+    def draw(self, policy: TensorDictModuleBase, env: EnvBase, row: dict, out: Path) -> Path:
+        """An animation ``episode_N.gif`` and a figure ``episode_N.png``, whose path is returned."""
+        from saferl.envs.intersection.pictures import draw  # late: few want pictures
+
+        return draw(policy, env, row, out)
 
     @property
     def form(self) -> Form:
@@ -163,18 +255,17 @@ class IntersectionBase(SeededEnv):
     every environment goes on in its own sequence of episodes, which follows from ``set_seed``.
     """
 
-    def __init__(self, scenario: Scenario, num_envs: int, seed: int, device=None):
-        super().__init__(num_envs, device)
-        self.scenario = scenario
+    def __init__(self, task: Scenario, num_envs: int, seed: int, device=None):
+        super().__init__(task, num_envs, device)
         self._make_specs()
         self.set_seed(seed)
 
     def _make_specs(self) -> None:
-        batch, form = self.batch_size, self.scenario.form
+        batch, form = self.batch_size, self.task.form
         flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool)
         self.observation_spec = Composite(
             ego=Unbounded(shape=(*batch, len(form.ego))),
-            vehicles=Unbounded(shape=(*batch, self.scenario.rows, len(form.vehicle))),
+            vehicles=Unbounded(shape=(*batch, self.task.rows, len(form.vehicle))),
             route=Categorical(len(ROUTES), shape=(*batch, 1), dtype=torch.int64),
             **{name: flag.clone() for name in OUTCOMES},
             shape=batch,

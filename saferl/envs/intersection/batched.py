@@ -9,7 +9,6 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from saferl.compiling import Compiled
 from saferl.envs.intersection.base import (
     OUTCOMES,
     STANDING,
@@ -31,6 +30,7 @@ from saferl.envs.intersection.traffic import (
     vehicle_states,
 )
 from saferl.envs.intersection.yielding import road_rules
+from saferl.modules.compiled import Compiled
 
 State = dict[str, Tensor]
 _VEHICLE, _LANE, _OWN = "vehicle_", "lane_", "own_"
@@ -197,7 +197,7 @@ class BatchedIntersection(IntersectionBase):
     """The CMDP with traffic, B environments in one set of tensors, on CPU or GPU.
 
     Args:
-        scenario: the task.
+        task: its settings.
         num_envs: B.
         seed: of the sequences of episodes.
         device: torch device.
@@ -211,14 +211,14 @@ class BatchedIntersection(IntersectionBase):
 
     def __init__(
         self,
-        scenario: Scenario,
+        task: Scenario,
         num_envs: int = 1,
         seed: int = 0,
         device=None,
         compile_physics: bool = False,
     ):
-        super().__init__(scenario, num_envs, seed, device)
-        self._advance, self._restart = partial(advance, scenario), partial(restart, scenario)
+        super().__init__(task, num_envs, seed, device)
+        self._advance, self._restart = partial(advance, task), partial(restart, task)
         if compile_physics:
             self._advance = Compiled(self._advance, "the simulation's step")
             self._restart = Compiled(self._restart, "the simulation's reset")
@@ -235,7 +235,7 @@ class BatchedIntersection(IntersectionBase):
         reset = self._reset_mask(tensordict)
         seeds = self._next_seeds(tensordict, reset)
         if not self._state:
-            self._state = scenes_last(begin(self.scenario, seeds))
+            self._state = scenes_last(begin(self.task, seeds))
         order = reset.to(torch.int8).argsort(descending=True, stable=True)
         for rows in order.split(self._chunk)[: -(-int(reset.sum()) // self._chunk)]:
             self._state = self._restart(self._state, seeds, reset, rows)

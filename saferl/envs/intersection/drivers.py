@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -160,21 +162,9 @@ class RandomDriver(Driver):
         return tensordict.set("action", (2 * action - 1).to(ego.dtype))
 
 
-#: Scripted drivers by the names that commands give them.
-DRIVERS = {"random": RandomDriver, "blind": Driver, "scripted": CautiousDriver}
-
-
-def driver(name: str, seed: int = 0) -> Driver:
-    """A scripted driver by its name; ``seed`` is the random one's.
-
-    Raises:
-        ValueError: there is none of this name.
-
-    >>> driver("cautious")
-    Traceback (most recent call last):
-    ...
-    ValueError: policy must be one of random, blind, scripted, got 'cautious'.
-    """
-    if name not in DRIVERS:
-        raise ValueError(f"policy must be one of {', '.join(DRIVERS)}, got {name!r}.")
-    return RandomDriver(seed) if name == "random" else DRIVERS[name]()
+#: Scripted drivers by the names that commands give them, each from a seed.
+DRIVERS: dict[str, Callable[[int], Driver]] = {
+    "random": RandomDriver,
+    "blind": lambda seed: Driver(),
+    "scripted": lambda seed: CautiousDriver(),
+}

@@ -21,7 +21,7 @@ class HighwayIntersection(ReplayedEnv, IntersectionBase):
     TorchRL's ``ParallelEnv``.
 
     Args:
-        scenario: the task.
+        task: its settings.
         num_envs: B.
         seed: of the sequences of episodes.
         device: of the tensors; the simulation itself runs on the CPU.
@@ -31,9 +31,10 @@ class HighwayIntersection(ReplayedEnv, IntersectionBase):
     torch.Size([2, 2, 1])
     """
 
-    def __init__(self, scenario: Scenario, num_envs: int = 1, seed: int = 0, device=None):
-        super().__init__(scenario, num_envs, seed, device)
-        settings = {f.name: getattr(scenario, f.name) for f in dataclasses.fields(scenario)}
+    def __init__(self, task: Scenario, num_envs: int = 1, seed: int = 0, device=None):
+        super().__init__(task, num_envs, seed, device)
+        fields = [f.name for f in dataclasses.fields(task) if f.name != "test_frequency"]
+        settings = {name: getattr(task, name) for name in fields}
         self.envs = [IntersectionEnv(**settings, render_mode="rgb_array") for _ in range(num_envs)]
         self._make_memory()
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
-from saferl.compiling import Compiled
+from saferl.modules.compiled import Compiled
 from saferl.modules.projection import project
 
 _STASH = "_safety_projection"

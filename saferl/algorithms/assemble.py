@@ -1,0 +1,193 @@
+"""From a run's configuration to a trainer, or to the agent that it holds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import hydra
+import torch
+from omegaconf import DictConfig, OmegaConf
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase, RewardSum, Transform, TransformedEnv
+from torchrl.envs.transforms import Compose
+
+from saferl.algorithms.base import Agent, Algorithm, Parts, make
+from saferl.checkpoint.run import FOLDER, latest, load_component, run_config
+from saferl.checkpoint.state import Fitting, Networks
+from saferl.config.check import arguments, check, check_targets, check_task
+from saferl.envs.task import Task
+from saferl.training.progress import Budget
+from saferl.training.records import EpisodeWindow
+from saferl.training.signals import ProjectorProgress
+from saferl.training.trainer import Trainer
+
+
+def build_env(
+    node: DictConfig,
+    task: Task,
+    num_envs: int,
+    seed: int,
+    device: str | torch.device = "cpu",
+    transforms: Sequence[Transform] = (),
+) -> EnvBase:
+    """A backend with a task; transforms from the inside outwards.
+
+    Args:
+        node: of the group ``env``.
+        task: what it plays.
+        num_envs: environments at once, in place of the node's number.
+        seed: of the sequences of episodes.
+        device: of the tensors.
+        transforms: around it.
+
+    Raises:
+        ValueError: the backend is of another kind of task.
+    """
+    kind = get_type_hints(hydra.utils.get_object(node._target_).__init__).get("task", object)
+    if not isinstance(task, kind):
+        raise ValueError(
+            f"{node._target_} plays a {kind.__name__}, but task={task.task} is a "
+            f"{type(task).__name__}: leave env= to the task."
+        )
+    env = make(node, {"num_envs": num_envs}, task=task, seed=seed, device=device)
+    return TransformedEnv(env, Compose(*transforms)) if transforms else env  # pyright: ignore
+
+
+def complete(cfg: DictConfig) -> None:
+    """Write into a configuration what its task takes from the environment itself.
+
+    Raises:
+        ValueError: the task's settings cannot be meant.
+    """
+    if "reward" in cfg.task and "reward" not in (arguments(cfg.task._target_) or {"reward"}):
+        raise ValueError(
+            f"shaping changes the road's reward, which task={cfg.task.task} has not: set shaping=none."
+        )
+    check_targets(cfg.task, "task")
+    OmegaConf.update(cfg, "task", hydra.utils.instantiate(cfg.task).complete())
+
+
+def build_loggers(sinks: Sequence[DictConfig], run: Path) -> list:
+    """TorchRL loggers that write into the run's folder.
+
+    Raises:
+        ValueError: a logger's own package is not installed.
+    """
+    try:
+        return [make(sink, log_dir=str(run)) for sink in sinks]
+    except ImportError as error:
+        names = ", ".join(sink._target_ for sink in sinks)
+        raise ValueError(
+            f"logger: {names} needs a package that is not installed ({error}); "
+            "install it (pip install 'saferl[wandb]' for W&B), or use logger=tensorboard or none."
+        ) from error
+
+
+def algorithm_of(cfg: DictConfig) -> Algorithm:
+    """The family of a run's algorithm, with its settings."""
+    return hydra.utils.instantiate(cfg.learning, _convert_="all")
+
+
+def build_agent(cfg: DictConfig) -> Agent:
+    """Networks, loss and projector of a run, on its device.
+
+    Raises:
+        ValueError: parts that do not go together.
+    """
+    return algorithm_of(cfg).agent(Parts.of(cfg))
+
+
+def load_agent(cfg: DictConfig, path: Path, name: str) -> Agent:
+    """The agent of a run or checkpoint as it was; ``name`` is the option that gave it.
+
+    Raises:
+        FileNotFoundError: there is no checkpoint.
+        ValueError: the checkpoint is of another architecture.
+    """
+    agent = build_agent(cfg)
+    load_component(latest(path, name), Fitting(agent.loss))
+    return agent
+
+
+def begin_from(agent: Agent, cfg: DictConfig, path: Path) -> None:
+    """Give an agent the networks of another run; all else stays as ``cfg`` says.
+
+    Raises:
+        FileNotFoundError: there is no checkpoint.
+        ValueError: another architecture; names the options that differ.
+    """
+    found, other = latest(path, "init"), run_config(path, "init")
+    other.device = cfg.device
+    ours, theirs = (algorithm_of(c).architecture(Parts.of(c)) for c in (cfg, other))
+    differing = {
+        key: f"{key} is {theirs[key]} there and {value} here"
+        for key, value in ours.items()
+        if key in theirs and theirs[key] != value
+    }
+    error = f"init: the networks of {path} do not fit: {', '.join(differing.values())}."
+    if any(not key.startswith("task.") for key in differing):  # an activation has no shape
+        raise ValueError(error)
+    try:
+        load_component(found, Networks(agent.loss))
+    except ValueError as reason:
+        if not differing:
+            raise
+        raise ValueError(error) from reason
+
+
+def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
+    """Everything of a training run, wired; fails before the first environment step if it must.
+
+    Args:
+        cfg: as composed, or as a run's file has it.
+        run: the run's folder.
+
+    Raises:
+        ValueError: something in the configuration cannot be meant; names the key.
+        FileNotFoundError: ``init`` names no checkpoint.
+    """
+    complete(cfg)
+    check(cfg)
+    torch.set_num_threads(cfg.threads)
+    torch.manual_seed(cfg.seed)
+    algorithm, parts = algorithm_of(cfg), Parts.of(cfg)
+    check_task(cfg.evaluation, parts.task)
+    agent, num_envs = algorithm.agent(parts), cfg.env.num_envs
+    if cfg.init and not (run / FOLDER).exists():  # a run that goes on has its own networks
+        begin_from(agent, cfg, Path(cfg.init))
+    sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
+    transforms: list[Any] = [sums, *algorithm.transforms()]
+    if agent.projector is not None:
+        transforms.append(agent.projector)
+    make_env = partial(build_env, cfg.env, parts.task, device=parts.device)
+    env = make_env(num_envs, cfg.seed, transforms=transforms)
+    collector = Collector(
+        env,
+        algorithm.behaviour(agent.actor, env),
+        frames_per_batch=algorithm.decisions(num_envs) * num_envs,
+        total_frames=-1,
+        init_random_frames=0 if cfg.init else algorithm.random_frames(),
+        track_traj_ids=False,
+        auto_register_policy_transforms=False,
+    )
+    learner = algorithm.learner(agent.loss, cfg.compile)
+    trainer = Trainer(
+        run=run,
+        collector=collector,
+        experience=algorithm.experience(agent, learner, parts.task, make_env, num_envs, cfg.seed),
+        learner=learner,
+        window=EpisodeWindow(parts.task.outcomes),
+        budget=Budget(cfg.episodes, cfg.frames),
+        record_every=cfg.record_every,
+        save_every=cfg.save_every,
+        save_minutes=cfg.save_minutes,
+        open_loggers=partial(build_loggers, cfg.logger.sinks, run),
+    )
+    if cfg.lagrange.signal._target_ is not None:
+        hydra.utils.instantiate(cfg.lagrange.signal).register(trainer)
+    if agent.projector is not None and hasattr(agent.projector, "set_progress"):
+        ProjectorProgress(agent.projector).register(trainer)
+    return trainer

@@ -1,0 +1,136 @@
+"""Algorithms that learn from fresh transitions alone: PPO, CPO and their kin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDictReplayBuffer
+from torchrl.envs import EnvBase, InitTracker, Transform
+from torchrl.objectives import LossModule, ValueEstimators
+
+from saferl.algorithms.base import (
+    STORED,
+    USUAL,
+    Agent,
+    Algorithm,
+    NetworkBuilder,
+    Parts,
+    critic_options,
+    keys_of,
+)
+from saferl.config.schema import OnPolicyLearning
+from saferl.envs.task import Task
+from saferl.modules import StateValue, value_operator
+from saferl.training.experience import Epochs
+from saferl.training.learner import Learner
+
+#: What losses read besides, once their ``begin`` has seen a batch.
+ADVANTAGES = (
+    *("action_log_prob", "advantage", "value_target", "state_value"),
+    *("cost_advantage", "cost_value_target"),
+)
+
+
+@dataclass
+class OnPolicy(OnPolicyLearning, Algorithm):
+    """Losses of state values V(s), by each batch of fresh transitions."""
+
+    values: ClassVar[str] = "critic_network"
+    risks: ClassVar[str] = "risk_critic"
+
+    def check(self, parts: Parts) -> None:
+        super().check(parts)
+        loss, has_risk = parts.loss._target_, self.risks in parts.takes
+        # Of the action values: those of on-policy losses are for a projector alone.
+        if has_risk and parts.cost_critic.members < 2:
+            raise ValueError(
+                f"{loss} needs several members of Q_c(s, a): set cost_critic=twin, "
+                f"got {parts.cost_critic.members}."
+            )
+        for name in ("critic",) if has_risk else ("critic", "cost_critic"):
+            critics = getattr(parts, name)
+            if critics.members > 1:
+                raise ValueError(
+                    f"{loss} has one state value: set {name}=single, got {critics.members} members."
+                )
+            for key, value in critic_options(critics).items():
+                if value != USUAL[key]:
+                    raise ValueError(
+                        f"{name}.{key} is of action values, which {loss} has not, got {value}."
+                    )
+
+    def loss_parts(self, networks: NetworkBuilder) -> dict[str, Callable[[], Any]]:
+        def state_value(out_key: str) -> torch.nn.Module:
+            encoder = networks.policy_encoder()
+            network = StateValue(encoder, networks.width).to(networks.parts.device)
+            return value_operator(network, in_keys=networks.reads(encoder), out_key=out_key)
+
+        return {
+            "critic_network": lambda: state_value("state_value"),
+            "cost_critic": lambda: state_value("state_cost_value"),
+            "risk_critic": networks.risk_critics,
+        }
+
+    def estimate(self, loss: LossModule, gamma: float) -> None:
+        loss.make_value_estimator(ValueEstimators.GAE, gamma=gamma, lmbda=self.gae_lambda)
+
+    def learner(self, loss: LossModule, compile: bool) -> Learner:
+        return Learner(
+            loss,
+            self.optimizer(loss),
+            compile=compile,
+            before_updates=before_updates(loss),
+        )
+
+    def decisions(self, num_envs: int) -> int:
+        return -(-self.rollout_frames // num_envs)
+
+    def transforms(self) -> list[Transform]:
+        return [InitTracker()]
+
+    def experience(
+        self,
+        agent: Agent,
+        learner: Learner,
+        task: Task,
+        build_env: Callable[[int, int], EnvBase],
+        num_envs: int,
+        seed: int,
+    ) -> Epochs:
+        frames = self.decisions(num_envs) * num_envs
+        if self.batch_size > frames:
+            raise ValueError(
+                f"learning.batch_size must be <= {frames}, the frames of a batch from one policy "
+                f"(learning.rollout_frames), got {self.batch_size}."
+            )
+        device = next(agent.loss.parameters()).device
+        buffer = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(frames, device=device),
+            # Without the rest of an epoch: a small batch would weigh as much as a whole one.
+            sampler=SamplerWithoutReplacement(drop_last=True),
+            batch_size=self.batch_size,
+            generator=torch.Generator(device).manual_seed(seed),
+        )
+        return Epochs(
+            buffer,
+            stored=(*keys_of(agent), *STORED, *ADVANTAGES),
+            begin=learner.begin,
+            epochs=self.epochs,
+            reward_scale=self.reward_scale,
+        )
+
+
+def before_updates(loss: Any) -> list[Callable[[TensorDictBase], Any]]:
+    """What an on-policy loss does with a whole batch: its advantages, and the step of its policy if it has one."""
+    # TorchRL's own losses leave their advantages to their estimator.
+    begin = getattr(loss, "begin", None) or partial(
+        loss.value_estimator,
+        params=loss.critic_network_params.detach(),
+        target_params=loss.target_critic_network_params,
+    )
+    return [begin, loss.policy_step().step] if hasattr(loss, "policy_step") else [begin]

@@ -1,0 +1,73 @@
+"""From a command line to a command: Hydra's composition, and one clear line for every mistake."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from saferl.cli.errors import MISTAKES, explain
+from saferl.config import schema
+from saferl.config.locate import config_dir
+
+PATHS = ("out", "checkpoint", "resume", "init")
+INTERRUPTED = 130
+
+
+def launch(command: str, config: str) -> None:
+    """Run the command ``saferl.cli.COMMAND`` on the configuration that ``sys.argv`` describes.
+
+    Exits with 0, with 1 after one line about a mistake, or with 130 after Ctrl-C.
+    ``HYDRA_FULL_ERROR=1`` shows the trace instead of the line.
+    """
+    # Threads of GNU's OpenMP that wait awake without end take the cores from another run's.
+    if "OMP_WAIT_POLICY" not in os.environ:
+        os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+    before = os.environ.get("HYDRA_FULL_ERROR")
+    # Hydra prints its own exceptions over many lines unless it is told to let them pass.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+
+    def run(cfg: DictConfig) -> None:
+        try:
+            for key in PATHS:
+                if cfg.get(key) == "":
+                    raise ValueError(f"{key} must be a path, got ''.")
+            schema.check(cfg)
+            # Late: help and most mistakes need no torch.
+            getattr(importlib.import_module(f"saferl.cli.{command}"), command)(cfg)
+        except BaseException as error:
+            _drop_if_empty(Path(HydraConfig.get().runtime.output_dir))
+            if isinstance(error, MISTAKES) and before != "1":
+                raise SystemExit(f"error: {explain(error)}") from None
+            raise
+
+    try:
+        hydra.main(version_base="1.3", config_path=config_dir(), config_name=config)(run)()
+    except BrokenPipeError:  # whoever read our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except MISTAKES as error:
+        if before == "1":
+            raise
+        raise SystemExit(f"error: {explain(error, config, sys.argv[1:])}") from None
+    except KeyboardInterrupt as interrupt:
+        print(str(interrupt) or "Interrupted.", file=sys.stderr)
+        raise SystemExit(INTERRUPTED) from None
+    finally:
+        del os.environ["HYDRA_FULL_ERROR"]
+        if before is not None:
+            os.environ["HYDRA_FULL_ERROR"] = before
+
+
+def _drop_if_empty(folder: Path) -> None:
+    """Undo the output folder, which Hydra makes before anything can be checked."""
+    here = Path.cwd()
+    with suppress(OSError):  # it is not empty, or not there
+        while folder != here:
+            folder.rmdir()
+            folder = folder.parent if folder.is_relative_to(here) else here

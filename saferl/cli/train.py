@@ -1,0 +1,116 @@
+"""Train, or continue a run, then test the result."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs.transforms import Transform
+
+from saferl.algorithms.assemble import build_trainer, complete
+from saferl.checkpoint.run import CONFIG, FOLDER, run_config, run_folder
+from saferl.cli.evaluate import compiling, measure, pictures, trained_policy
+from saferl.evaluation.compare import side_by_side
+from saferl.evaluation.statistics import FIGURES, summarise
+
+log = logging.getLogger(__name__)
+
+
+def train(cfg: DictConfig) -> None:
+    """Train, or continue a run, then test the result."""
+    resuming = cfg.resume is not None
+    if not resuming:
+        run = Path(HydraConfig.get().runtime.output_dir)
+        complete(cfg)
+        OmegaConf.resolve(cfg)
+        claim(run, cfg)
+    else:
+        others = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]
+        if others:
+            raise ValueError(
+                "resume continues a run as it was configured and takes no other option, "
+                f"got {', '.join(others)}."
+            )
+        run = run_folder(Path(str(cfg.resume)), "resume")
+        cfg = run_config(run)
+    try:
+        trainer = build_trainer(cfg, run)
+        if resuming:
+            trainer.resume()
+        log.info("%s on %s, seed %d. Files: %s", cfg.algo_name, cfg.task.task, cfg.seed, run)
+        trainer.train()
+    finally:
+        if not resuming and not (run / FOLDER).exists():  # it never began
+            (run / CONFIG).unlink(missing_ok=True)
+
+    cfg = compiling(cfg, False)  # the closing test is over before compiling would pay
+    try:
+        closing_test(cfg, run)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(
+            f"Interrupted in the closing test. Repeat it with resume={run}"
+        ) from None
+
+
+def closing_test(cfg: DictConfig, run: Path) -> None:
+    """Test what a run has learned, beside the scripted drivers that it names, and draw its first episodes."""
+    settings = cfg.evaluation
+    task = hydra.utils.instantiate(cfg.task).as_test()
+    policy, transforms = trained_policy(cfg, run)
+
+    def test(policy: TensorDictModuleBase, transforms: Sequence[Transform], name: str, out: Path):
+        return measure(
+            cfg.env,
+            task,
+            policy,
+            transforms,
+            out=out,
+            num_envs=settings.num_envs,
+            episodes=settings.episodes,
+            seed=cfg.seed,
+            device=cfg.device,
+            policy_name=name,
+            cost_limit=cfg.cost_limit,
+        )
+
+    out = run / "evaluation"
+    results = {cfg.algo_name: test(policy, transforms, cfg.algo_name, out)}
+    for name in settings.drivers:
+        results[name] = test(task.driver(name, cfg.seed), [], name, out / name)
+    if settings.drivers:
+        title = f"The same {settings.episodes} episodes of {task.task}"
+        runs = [
+            (
+                {"algo_name": name, "task": {"task": task.task}},
+                {"episodes": len(rows), **summarise(rows)},
+            )
+            for name, rows in results.items()
+        ]
+        log.info("\n%s\n%s", title, side_by_side(runs, tuple(FIGURES)))
+    pictures(
+        cfg.env, task, policy, transforms, results[cfg.algo_name][: settings.gif], out, cfg.device
+    )
+
+
+def claim(run: Path, cfg: DictConfig) -> None:
+    """Make a folder this run's own; of two runs that want it at once, one gets it.
+
+    Raises:
+        ValueError: it holds a run already.
+    """
+    run.mkdir(parents=True, exist_ok=True)
+    try:
+        if (run / FOLDER).exists():
+            raise FileExistsError
+        with (run / CONFIG).open("x") as file:
+            OmegaConf.save(cfg, file)
+    except FileExistsError:
+        way = f"continue it with resume={run}, or take another folder."
+        if not (run / FOLDER).exists():
+            way = "it has just begun, or was killed before its first checkpoint and can be deleted."
+        raise ValueError(f"out: {run} holds a run already; {way}") from None

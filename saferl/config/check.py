@@ -1,0 +1,150 @@
+"""Refuse a configuration that cannot be meant, before anything is built from it."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import fields, is_dataclass
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import hydra
+from omegaconf import DictConfig, ListConfig
+
+from saferl.config import schema
+from saferl.envs.task import Task
+
+_KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+_KINDS |= {NoneType: "null"}
+
+
+def check(cfg: DictConfig) -> None:
+    """Check all that a configuration says, but for what its parts say of each other.
+
+    Raises:
+        ValueError: names the key, the value and what is allowed.
+    """
+    schema.check(cfg)
+    check_targets(cfg)
+
+
+def check_task(evaluation: Any, task: Task) -> None:
+    """Check what the closing test of a training asks of its task.
+
+    Raises:
+        ValueError: drivers or pictures that the task has not.
+    """
+    for name in evaluation.drivers:
+        if name not in task.drivers:
+            choices = ", ".join(task.drivers) or f"none: task={task.task} has no drivers"
+            raise ValueError(f"evaluation.drivers must be among {choices}, got {name!r}.")
+    if evaluation.gif and not task.pictures:
+        raise ValueError(
+            f"evaluation.gif must be 0, as task={task.task} draws no pictures, got {evaluation.gif}."
+        )
+
+
+def check_targets(node: Any, path: str = "", kind: Any = None) -> None:
+    """Check each ``_target_`` below a node against its signature (names and kinds of arguments), each
+    mapping that stands for a dataclass (``kind``) against its fields, and that every number is finite.
+
+    Raises:
+        ValueError: names the key and what is allowed.
+    """
+    if isinstance(node, float) and not math.isfinite(node):
+        raise ValueError(f"{path} must be finite, got {node}.")
+    if isinstance(node, ListConfig):
+        for index, item in enumerate(node):
+            check_targets(item, f"{path}[{index}]")
+    if not isinstance(node, DictConfig):
+        return
+    target = node.get("_target_")
+    accepted = None if target is None else arguments(target)
+    if target is None and is_dataclass(kind):
+        target, accepted = f"{path}, a {kind.__name__},", get_type_hints(kind)  # pyright: ignore
+    for key, value in node.items():
+        name = f"{path}.{key}".removeprefix(".")
+        if accepted is not None and not str(key).startswith("_"):
+            if key not in accepted:
+                raise ValueError(
+                    f"unknown key {name}: {target} takes {', '.join(accepted) or 'nothing'}."
+                )
+            if not isinstance(value, DictConfig) and not fits(value, accepted[key]):
+                raise ValueError(f"{name} must be {describe(accepted[key])}, got {value!r}.")
+        check_targets(value, name, (accepted or {}).get(str(key)))
+
+
+def arguments(target: str) -> dict[str, Any] | None:
+    """Arguments that a ``_target_`` takes with their annotations; None where it takes any.
+
+    Raises:
+        ValueError: there is no such class or function.
+    """
+    try:
+        function = hydra.utils.get_object(target)
+    except Exception as error:
+        raise ValueError(f"_target_ names nothing that can be imported: {target!r}.") from error
+    # A metaclass, as TorchRL's environments have, hides what __init__ takes.
+    function = function.__init__ if inspect.isclass(function) else function
+    if function is object.__init__:
+        return {}
+    try:
+        signature = inspect.signature(function, eval_str=True)
+    except NameError:  # annotations that exist for type checkers alone
+        signature = inspect.signature(function)
+    parameters = signature.parameters
+    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values()):
+        return None
+    return {name: p.annotation for name, p in parameters.items() if name != "self"}
+
+
+def fits(value: Any, kind: Any) -> bool:
+    """Whether a value is of an annotated kind; kinds that YAML cannot say fit everything.
+
+    >>> fits(3, float), fits("3", float), fits(True, int), fits([1, 2.5], tuple[float, float])
+    (True, False, False, True)
+    """
+    if kind in (int, float):
+        numbers = (int, float) if kind is float else int
+        return isinstance(value, numbers) and not isinstance(value, bool)
+    if kind in _KINDS or kind is None:
+        return isinstance(value, kind or NoneType)
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in (Union, UnionType):
+        return any(fits(value, option) for option in inner)
+    if origin is Literal:
+        return value in inner
+    if origin in (tuple, list, Sequence) and inner[0] in _KINDS:
+        listed = isinstance(value, (list, tuple, ListConfig))
+        if origin is tuple and Ellipsis not in inner and listed and len(value) != len(inner):
+            return False
+        return listed and all(fits(item, inner[0]) for item in value)
+    if origin is Callable:
+        return callable(value)
+    if origin is type:
+        return inspect.isclass(value)
+    return not is_dataclass(kind)
+
+
+def describe(kind: Any) -> str:
+    """A kind in words.
+
+    >>> describe(int | None)
+    'a whole number or null'
+    """
+    if get_origin(kind) in (Union, UnionType):
+        return " or ".join(describe(option) for option in get_args(kind))
+    if get_origin(kind) is Literal:
+        return " or ".join(map(str, get_args(kind)))
+    if get_origin(kind) in (tuple, list, Sequence):
+        inner = get_args(kind)
+        size = f" of {len(inner)}" if get_origin(kind) is tuple and Ellipsis not in inner else ""
+        return f"a list{size}, each {describe(inner[0])}"
+    if get_origin(kind) is Callable:
+        return "a function, by its _target_"
+    if get_origin(kind) is type:
+        return "a class, by its _target_"
+    if is_dataclass(kind):
+        return f"a mapping of {', '.join(field.name for field in fields(kind))}"
+    return _KINDS.get(kind, str(kind))

@@ -1,0 +1,63 @@
+"""What a configuration can ask: resolvers of OmegaConf."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import sysconfig
+from pathlib import Path
+
+import hydra
+from omegaconf import OmegaConf
+
+# ${first:a,b} in a configuration is the first of its arguments that is not null.
+OmegaConf.register_new_resolver(
+    "first", lambda *values: next(v for v in values if v is not None), replace=True
+)
+# ${when:a,b} is b where a is not null, else null.
+OmegaConf.register_new_resolver(
+    "when", lambda given, value: None if given is None else value, replace=True
+)
+
+# ${unless:a,b} is b where a is null, else null.
+OmegaConf.register_new_resolver(
+    "unless", lambda given, value: value if given is None else None, replace=True
+)
+# ${ceil_div:a,b} is a / b, rounded up; a where the two are not whole, as the check of a and b will say.
+OmegaConf.register_new_resolver(
+    "ceil_div",
+    lambda a, b: -(-a // b) if isinstance(a, int) and isinstance(b, int) and b else a,
+    replace=True,
+)
+
+# ${decisions:${task}}: how many an episode has at most.
+OmegaConf.register_new_resolver(
+    "decisions",
+    lambda task: hydra.utils.instantiate(task).horizon,
+    replace=True,
+)
+
+
+#: A budget for which compiling pays, which takes minutes.
+LONG = {"episodes": 2_000, "frames": 100_000}
+
+
+def pays_to_compile(episodes: int | None, frames: int | None) -> bool:
+    """Whether a budget is long and torch finds what it compiles with: a C++ compiler, Python's headers.
+
+    >>> pays_to_compile(episodes=10, frames=None)
+    False
+    """
+    usual = {"darwin": "clang++", "win32": "cl"}.get(sys.platform, "g++")
+    able = (
+        shutil.which(os.environ.get("CXX", usual))
+        and (Path(sysconfig.get_path("include")) / "Python.h").is_file()
+    )
+    budget = {"episodes": episodes, "frames": frames}
+    long = any(isinstance(n, int) and n >= LONG[kind] for kind, n in budget.items())
+    return bool(able and long)
+
+
+# ${pays_to_compile:${episodes},${frames}}
+OmegaConf.register_new_resolver("pays_to_compile", pays_to_compile, replace=True)

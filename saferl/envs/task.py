@@ -1,0 +1,115 @@
+"""What a task says of itself, so that nothing else asks what kind of task it has."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+
+class Task:
+    """Base of a task's settings, which are a frozen dataclass.
+
+    As it stands here a task observes one vector, ``observation`` [size], and has neither drivers nor pictures.
+
+    Attributes:
+        task: what runs are called.
+        size, action_dim: numbers of an observation and of an action.
+        horizon: decisions of an episode at most; None where :meth:`complete` tells.
+        drivers: scripted policies by name, each made from a seed.
+        demonstrators: names of the drivers whose transitions a replay buffer may begin with.
+        in_tests: what a test changes in these settings.
+        pictures: whether :meth:`draw` draws.
+    """
+
+    task: str
+    size: Any
+    action_dim: Any
+    horizon: Any
+    drivers: ClassVar[Mapping[str, Callable[[int], TensorDictModuleBase]]] = {}
+    demonstrators: ClassVar[Sequence[str]] = ()
+    in_tests: ClassVar[Mapping[str, Any]] = {}
+    pictures: ClassVar[bool] = False
+
+    @property
+    def observed(self) -> Mapping[str, tuple[int, ...]]:
+        """What a network may read of a step: keys, and their shapes without batch dimensions."""
+        return {"observation": (self.size,)}
+
+    @property
+    def network(self) -> Mapping[str, Any]:
+        """What a network may be built from, by the names of its arguments: sizes, feature scales."""
+        return {"size": self.size, "action_dim": self.action_dim}
+
+    @property
+    def title(self) -> str:
+        """What heads a table of a test."""
+        return self.task
+
+    def complete(self) -> Mapping[str, Any]:
+        """Settings that are left open and follow from the environment itself."""
+        return {}
+
+    def as_test(self) -> Self:
+        """The task under the conditions of a test, :attr:`in_tests`."""
+        changes = {
+            key: dataclasses.replace(getattr(self, key), **value)
+            if isinstance(value, Mapping)
+            else value
+            for key, value in self.in_tests.items()
+        }
+        return dataclasses.replace(self, **changes)  # pyright: ignore[reportArgumentType]
+
+    def check_policy_of(self, trained: Self) -> None:
+        """Refuse a policy that was trained on other observations than these.
+
+        Raises:
+            ValueError: names the setting.
+        """
+
+    def driver(self, name: str, seed: int = 0) -> TensorDictModuleBase:
+        """A scripted driver by its name; ``seed`` is for those who draw.
+
+        Raises:
+            ValueError: there is none of this name.
+        """
+        if name not in self.drivers:
+            choices = ", ".join(self.drivers) or f"none: task={self.task} has no drivers"
+            raise ValueError(f"policy must be among {choices}, got {name!r}.")
+        return self.drivers[name](seed)
+
+    def outcomes(self, last: TensorDictBase) -> Mapping[str, Tensor]:
+        """How episodes ended, from what their last steps left, [n, ...]: 0 or 1 by name, float [n]."""
+        return {}
+
+    def figures(self, steps: Sequence[TensorDictBase], counts: Sequence[int]) -> list[dict]:
+        """Columns of a test's rows, one dict for each of B episodes, beside those that every task has.
+
+        Args:
+            steps: transitions of every decision, each [B].
+            counts: how many of them belong to each episode.
+        """
+        return [{} for _ in counts]
+
+    def describe(self) -> dict[str, Any]:
+        """What the file of a test says of its task."""
+        return dataclasses.asdict(self)  # pyright: ignore[reportArgumentType]
+
+    def draw(self, policy: TensorDictModuleBase, env: EnvBase, row: dict, out: Path) -> Path:
+        """Play an episode of a test again and draw it.
+
+        Args:
+            policy, env: as the test played it, the environment of batch size 1.
+            row: of the episode, with its ``episode`` number and ``seed``.
+            out: folder of the pictures.
+
+        Returns:
+            The path of one of them.
+        """
+        raise NotImplementedError

@@ -1,0 +1,1 @@
+"""Test episodes: played, measured, compared and drawn."""

@@ -1,0 +1,72 @@
+"""One row of figures for each episode, and the files of a test."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from saferl.envs.task import Task
+from saferl.evaluation.statistics import summarise
+
+
+def episode_rows(steps: list[TensorDictBase], seeds: Tensor, task: Task) -> list[dict]:
+    """Figures of each episode of :func:`saferl.evaluation.play.play`: one dict an episode, in the order of ``seeds``.
+
+    Beside those of the task stand ``return``, ``cost_return``, ``intervention_rate``, the share of decisions that a
+    projector changed, ``correction``, the mean size of such a change, and ``decisions``.
+    """
+    after = steps[0]["next"]
+
+    def over_time(key: str) -> Tensor:
+        return torch.stack([step["next", key].double().squeeze(-1) for step in steps]).cpu()
+
+    counts = torch.stack([step["alive"] for step in steps]).sum(0).tolist()
+    values = {"return": over_time("reward"), "cost_return": over_time("cost")}
+    shift = torch.zeros_like(values["cost_return"])
+    if "action_executed" in after:
+        shift = torch.stack(
+            [
+                torch.linalg.vector_norm(step["next", "action_executed"] - step["action"], dim=-1)
+                for step in steps
+            ]
+        ).cpu()
+    # A projector of one's own need not say where it intervened.
+    moved = over_time("intervened") if "intervened" in after else (shift > 0).to(shift)
+    values |= {"intervention_rate": moved, "correction": shift}
+    rows, own = [], task.figures(steps, counts)
+    for index, (seed, count) in enumerate(zip(seeds.tolist(), counts, strict=True)):
+        # Exact sums: they do not depend on how long the episodes beside this one lasted.
+        total = {key: math.fsum(value[:count, index].tolist()) for key, value in values.items()}
+        rows.append(
+            {
+                "seed": seed,
+                **own[index],
+                "return": total["return"],
+                "cost_return": total["cost_return"],
+                "intervention_rate": total["intervention_rate"] / count,
+                "correction": total["correction"] / max(total["intervention_rate"], 1.0),
+                "decisions": count,
+            }
+        )
+    return rows
+
+
+def write(rows: list[dict], out: Path, /, **about: Any) -> dict:
+    """Write ``episodes.csv`` and ``metrics.json`` into a folder; returns the metrics."""
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / "episodes.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    figures = summarise(rows)
+    (out / "metrics.json").write_text(
+        json.dumps({**figures, **about}, indent=2, allow_nan=False) + "\n"
+    )
+    return figures

@@ -1,0 +1,123 @@
+"""What a learner updates from: transitions that are kept, or fresh ones alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torchrl.data import ReplayBuffer
+
+from saferl.checkpoint.state import BufferState
+
+
+def _flat(data: TensorDictBase, keys: Sequence[NestedKey]) -> TensorDictBase:
+    return data.select(*keys, strict=False).contiguous().reshape(-1)
+
+
+class Replay:
+    """Transitions are kept and sampled again and again, as off-policy losses allow.
+
+    Args:
+        buffer: its transforms decide what is stored and what is sampled.
+        stored: keys of a transition that it keeps, where they exist.
+        updates_per_frame: batches for each collected frame.
+        warmup_frames: collected before the first batch.
+        demonstrate: gives transitions [N] that the buffer holds before the first frame, or None; they
+            count as no frames.
+
+    Raises:
+        ValueError: a number out of range.
+    """
+
+    def __init__(
+        self,
+        buffer: ReplayBuffer,
+        stored: Sequence[NestedKey],
+        updates_per_frame: float = 0.25,
+        warmup_frames: int = 1000,
+        demonstrate: Callable[[], TensorDictBase] | None = None,
+    ):
+        for name, value, least in (
+            ("updates_per_frame", updates_per_frame, 0),
+            ("warmup_frames", warmup_frames, 1),
+        ):
+            if value < least:
+                raise ValueError(f"{name} must be >= {least}, got {value}.")
+        self.buffer, self.stored = buffer, stored
+        self.updates_per_frame, self.warmup_frames = updates_per_frame, warmup_frames
+        self.demonstrate = demonstrate
+        self.owed = 0.0
+
+    def prepare(self) -> None:
+        """Before the first frame of a new run."""
+        if self.demonstrate is not None:
+            self.buffer.extend(_flat(self.demonstrate(), self.stored))
+
+    def batches(self, data: TensorDictBase, frames: int) -> Iterator[TensorDictBase]:
+        """Take collected data [B, T], the run's frame number ``frames`` its last; yields a batch for each
+        update that it entitles to."""
+        self.buffer.extend(_flat(data, self.stored))
+        if frames < self.warmup_frames:
+            return
+        self.owed += data.numel() * self.updates_per_frame
+        while self.owed >= 1.0:
+            self.owed -= 1.0
+            yield self.buffer.sample()
+
+    def state_dict(self) -> dict[str, Any]:
+        return {**BufferState(self.buffer).state_dict(), "owed": self.owed}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        BufferState(self.buffer).load_state_dict(state)
+        self.owed = state["owed"]
+
+
+class Epochs:
+    """Each batch of fresh transitions is gone through a few times in mini-batches, and forgotten.
+
+    Args:
+        buffer: as large as a batch, with a generator and a sampler without replacement.
+        stored: keys of a transition that the loss reads, where they exist.
+        begin: is given each batch [B, T] first, and writes advantages and value targets into it.
+        epochs: how often a batch is gone through.
+        reward_scale: of the reward that ``begin`` sees.
+
+    Raises:
+        ValueError: fewer than one epoch.
+    """
+
+    def __init__(
+        self,
+        buffer: ReplayBuffer,
+        stored: Sequence[NestedKey],
+        begin: Callable[[TensorDictBase], Any],
+        epochs: int = 10,
+        reward_scale: float = 1.0,
+    ):
+        if epochs < 1:
+            raise ValueError(f"epochs must be >= 1, got {epochs}.")
+        self.buffer, self.stored, self.begin = buffer, stored, begin
+        self.epochs, self.reward_scale = epochs, reward_scale
+
+    def prepare(self) -> None:
+        """Nothing is needed before the first frame."""
+
+    def batches(self, data: TensorDictBase, frames: int) -> Iterator[TensorDictBase]:
+        """Take collected data [B, T]; yields the mini-batches of its epochs."""
+        data = data.clone(recurse=False)
+        following = data.get("next").clone(recurse=False)
+        data.set("next", following.set("reward", following.get("reward") * self.reward_scale))
+        self.begin(data)
+        self.buffer.empty()
+        self.buffer.extend(_flat(data, self.stored))
+        for _ in range(self.epochs):
+            yield from self.buffer
+
+    def state_dict(self) -> dict[str, Any]:
+        """What shuffles the mini-batches: no transition outlives its batch, and checkpoints are made between them."""
+        return {"generator": self.buffer._rng.get_state()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.buffer._rng.set_state(state["generator"].cpu())

@@ -1,0 +1,121 @@
+"""What a run writes down: means over its last episodes, and files of scalars."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from saferl.evaluation.statistics import FIGURES
+
+#: How episodes ended, [n] by name, from their last steps: :meth:`saferl.envs.task.Task.outcomes`.
+Outcomes = Callable[[TensorDictBase], Mapping[str, torch.Tensor]]
+
+
+def no_outcomes(last: TensorDictBase) -> Mapping[str, torch.Tensor]:
+    """No outcomes."""
+    return {}
+
+
+def finished_episodes(data: TensorDictBase, outcomes: Outcomes = no_outcomes) -> TensorDict:
+    """Episodes that end within collected data.
+
+    Args:
+        data: [*B, T] transitions with ``("next", ...)`` ``done``, ``episode_reward`` and
+            ``episode_cost`` (TorchRL's RewardSum).
+        outcomes: the task's own.
+
+    Returns:
+        [n] TensorDict of float ``return``, ``cost_return`` and the outcomes.
+    """
+    after = data.get("next")
+    ends = after[after["done"].squeeze(-1)]
+    figures = {
+        "return": ends["episode_reward"].squeeze(-1),
+        "cost_return": ends["episode_cost"].squeeze(-1),
+    }
+    return TensorDict({**figures, **outcomes(ends)}, batch_size=ends.batch_size[:1])
+
+
+class EpisodeWindow:
+    """Means over the last episodes.
+
+    ``return`` holds r_safe where ``shaping=risk`` adds it, and is then not to be compared with other
+    algorithms'; the return of a test never does.
+
+    Args:
+        outcomes: how the task's episodes end.
+        length: how many episodes.
+
+    >>> EpisodeWindow().short()
+    {}
+    """
+
+    def __init__(self, outcomes: Outcomes = no_outcomes, length: int = 200):
+        self.outcomes, self.length = outcomes, length
+        self.values: dict[str, torch.Tensor] = {}
+
+    def extend(self, data: TensorDictBase) -> TensorDict:
+        """Take collected data [*B, T]; returns its finished episodes [n]."""
+        episodes = finished_episodes(data, self.outcomes)
+        for key, new in episodes.items():
+            old = self.values.get(str(key), torch.zeros(0))
+            self.values[str(key)] = torch.cat([old, new.cpu()])[-self.length :]
+        return episodes
+
+    def summary(self) -> dict[str, float]:
+        """Mean return, cost return and rates of the window; NaN before the first episode."""
+        return {
+            f"{key}_rate" if f"{key}_rate" in FIGURES else key: round(float(value.mean()), 6)
+            for key, value in self.values.items()
+        }
+
+    def short(self) -> dict[str, str]:
+        """The summary for a progress bar; empty before the first episode."""
+        if not any(map(len, self.values.values())):
+            return {}
+        figures = self.summary()
+        bar = {"return": f"{figures['return']:.1f}", "cost": f"{figures['cost_return']:.3f}"}
+        rates = {"CR": "collision_rate", "SR": "success_rate"}
+        return bar | {name: f"{figures[key]:.0%}" for name, key in rates.items() if key in figures}
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        return dict(self.values)
+
+    def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
+        self.values = {key: value.clone() for key, value in state.items()}
+
+
+class CsvLog:
+    """Rows of scalars; a new column rewrites the file's header, so no value is lost."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def read(self) -> list[dict[str, float]]:
+        """The rows so far, without what a row leaves empty."""
+        if not self.path.exists():
+            return []
+        with self.path.open(newline="") as file:
+            return [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file)]
+
+    def write(self, row: dict[str, float]) -> None:
+        """Append a row (keys are column names)."""
+        rows, columns = [], []
+        if self.path.exists():
+            with self.path.open(newline="") as file:
+                columns = next(csv.reader(file), [])
+        new = [key for key in row if key not in columns]
+        if new and columns:
+            with self.path.open(newline="") as file:
+                rows = list(csv.DictReader(file))
+        columns = [*columns, *new]
+        with self.path.open("w" if new else "a", newline="") as file:
+            writer = csv.DictWriter(file, columns, restval="", lineterminator="\n")
+            if new:
+                writer.writeheader()
+                writer.writerows(rows)
+            writer.writerow(row)

@@ -1,0 +1,267 @@
+"""The training loop: collect, store, learn, record, save."""
+
+from __future__ import annotations
+
+import logging
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.collectors import Collector
+from torchrl.record.loggers import Logger
+from tqdm import tqdm
+
+from saferl.checkpoint.run import RunCheckpoint
+from saferl.checkpoint.state import CollectorState, Fitting, GrowingFiles
+from saferl.training.learner import Learner
+from saferl.training.progress import Budget, Clock, Progress
+from saferl.training.records import CsvLog, EpisodeWindow
+
+log = logging.getLogger(__name__)
+
+
+class Experience(Protocol):
+    """What the trainer asks of :mod:`saferl.training.experience`."""
+
+    def prepare(self) -> None: ...
+
+    def batches(self, data: TensorDictBase, frames: int) -> Iterator[TensorDictBase]: ...
+
+    def state_dict(self) -> dict[str, Any]: ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None: ...
+
+
+@contextmanager
+def _interrupts() -> Iterator[list[int]]:
+    """Collects Ctrl-C and SIGTERM, so that a run ends between two steps; a second one ends it now."""
+    received: list[int] = []
+
+    def note(number: int, frame: object) -> None:
+        if received:
+            raise KeyboardInterrupt(
+                "Interrupted twice: what came after the last checkpoint is lost."
+            )
+        received.append(number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield received
+        return
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@dataclass
+class Trainer:
+    """Trains from built parts; it knows none of them by name.
+
+    Attributes:
+        run: folder of the run's files.
+        collector: yields [B, T] batches of transitions.
+        experience: takes each batch, and gives what the learner updates from.
+        learner: makes one update from what it is given.
+        budget: how long.
+        record_every: frames between two rows of ``metrics.csv``.
+        save_every: frames between two checkpoints.
+        save_minutes: of wall-clock, after which a checkpoint is due all the same; None: never.
+        after_collect: called with each batch's finished episodes (a TensorDict of per-episode
+            ``return``, ``cost_return`` and outcomes, [n]) and the fraction of the budget spent.
+        open_loggers: makes the TorchRL loggers that receive the scalars of each row; called when
+            training starts.
+        window: means over the last episodes.
+    """
+
+    run: Path
+    collector: Collector
+    experience: Experience
+    learner: Learner
+    budget: Budget
+    record_every: int = 2000
+    save_every: int = 50_000
+    save_minutes: float | None = 5.0
+    window: EpisodeWindow = field(default_factory=EpisodeWindow)
+    after_collect: list[Callable[[TensorDictBase, float], None]] = field(default_factory=list)
+    open_loggers: Callable[[], Sequence[Logger]] = list
+
+    def __post_init__(self):
+        for name in ("record_every", "save_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be >= 1, got {getattr(self, name)}.")
+        if self.save_minutes is not None and not self.save_minutes > 0:
+            raise ValueError(f"save_minutes must be null or > 0, got {self.save_minutes}.")
+        self.progress, self.clock = Progress(), Clock()
+        self.metrics = CsvLog(self.run / "metrics.csv")
+        self.timing = CsvLog(self.run / "timing.csv")
+        self._sums: dict[str, Tensor] = {}
+        self._count = 0
+        self._loggers: Sequence[Logger] = ()
+        self._saved_at = time.monotonic()
+        self.checkpoint = RunCheckpoint(
+            self.run,
+            loss=Fitting(self.learner.loss),
+            optimizer=self.learner.optimizer,
+            buffer=self.experience,
+            collector=CollectorState(self.collector),
+            progress=self.progress,
+            clock=self.clock,
+            window=self.window,
+            record=self,
+            files=GrowingFiles(self.metrics.path, self.timing.path),
+        )
+
+    def state_dict(self) -> dict:
+        """Means of the loss terms since the last row."""
+        return {"sums": self._sums, "count": self._count}
+
+    def load_state_dict(self, state: dict) -> None:
+        self._sums, self._count = dict(state["sums"]), state["count"]
+
+    def resume(self) -> None:
+        """Continue from the newest checkpoint of the run.
+
+        Raises:
+            FileNotFoundError: there is none.
+            ValueError: it does not fit what was built.
+        """
+        path = self.checkpoint.load_latest()
+        log.info("Resumed %s at frame %d.", path, self.progress.frames)
+
+    @property
+    def spent(self) -> float:
+        """Fraction of the budget that is spent, in [0, 1]."""
+        return self.budget.spent(self.progress.frames, self.progress.episodes)
+
+    def train(self) -> None:
+        """Train until the budget is spent; checkpoints at the start, now and then, and at the end.
+
+        Raises:
+            KeyboardInterrupt: the first Ctrl-C, after a checkpoint was left; a second one at once.
+        """
+        progress = self.progress
+        by_episode = self.budget.episodes is not None
+        bar = tqdm(
+            total=self.budget.whole,
+            initial=progress.episodes if by_episode else progress.frames,
+            unit="episode" if by_episode else "frame",
+            desc="train",
+            dynamic_ncols=True,
+            mininterval=1.0,
+            postfix=self.window.short(),
+        )
+        batches = iter(self.collector)
+        with self._logging(), _interrupts() as interrupted, bar:
+            if progress.last_save < 0:
+                self.experience.prepare()
+                self.save()
+            while self.spent < 1.0 and not interrupted:
+                with self.clock.phase("collect"):
+                    data = next(batches)
+                if len(self._take(data)):
+                    bar.set_postfix(self.window.short(), refresh=False)
+                bar.update((progress.episodes if by_episode else progress.frames) - bar.n)
+                if progress.frames - progress.last_record >= self.record_every:
+                    self._record()
+                if self._save_is_due() and self.spent < 1.0:
+                    self.save()
+            if interrupted:
+                self.save()
+                raise KeyboardInterrupt(
+                    f"Interrupted at frame {progress.frames}. Continue with resume={self.run}"
+                )
+            if progress.frames > progress.last_record:
+                self._record()
+        self.save()
+
+    @contextmanager
+    def _logging(self) -> Iterator[None]:
+        """Opens the loggers and tells them the rows of ``metrics.csv``, which a resume has cut off at
+        its checkpoint, in place of what an earlier process told them."""
+        self._loggers = self.open_loggers()
+        try:
+            for sink in [logger.experiment for logger in self._loggers]:
+                # TensorBoard keeps every event; a new file can hide those of the files before it.
+                if self.progress.last_save >= 0 and hasattr(sink, "purge_step"):
+                    sink.close()
+                    sink.purge_step = 0
+            for row in self.metrics.read():
+                self._log(row)
+            yield
+        finally:
+            # TorchRL's loggers have no end of their own; what they write to does.
+            for logger in self._loggers:
+                sink = logger.experiment
+                end = getattr(sink, "close", None) or getattr(sink, "finish", None)
+                if end is not None:
+                    end()
+
+    def _log(self, row: dict[str, float]) -> None:
+        for logger in self._loggers:
+            for key, value in row.items():
+                logger.log_scalar(key, value, step=int(row["frames"]))
+
+    def _save_is_due(self) -> bool:
+        minutes = (time.monotonic() - self._saved_at) / 60
+        frames = self.progress.frames - self.progress.last_save
+        return frames >= self.save_every or minutes >= (self.save_minutes or math.inf)
+
+    def save(self) -> None:
+        """Write a checkpoint of everything, unless the newest one is of this very frame."""
+        if self.progress.last_save < self.progress.frames:
+            self.progress.last_save = self.progress.frames
+            self.checkpoint.save(self.progress.frames, {"episodes": self.progress.episodes})
+        self._saved_at = time.monotonic()
+
+    def _take(self, data: TensorDictBase) -> TensorDict:
+        """Make the updates that a batch entitles to; returns its finished episodes [n]."""
+        progress = self.progress
+        # Of what was spent when these frames were begun: the last batch of a run is learned from, too.
+        self.learner.schedule(self.spent)
+        finished = self.window.extend(data)
+        progress.frames += data.numel()
+        progress.episodes += finished.shape[0]
+        for hook in self.after_collect:
+            hook(finished, self.spent)
+        with self.clock.phase("learn"):
+            for batch in self.experience.batches(data, progress.frames):
+                progress.updates += 1
+                self._add(self.learner.update(batch))
+        return finished
+
+    def _add(self, losses: TensorDictBase) -> None:
+        for key, value in losses.items():
+            if value.numel() == 1:
+                self._sums[key] = self._sums.get(key, 0.0) + value.reshape(())
+        self._count += 1
+
+    def _record(self) -> None:
+        """One row of ``metrics.csv`` (no wall-clock) and one of ``timing.csv``."""
+        progress = self.progress
+        progress.last_record = progress.frames
+        row = {
+            "frames": progress.frames,
+            "episodes": progress.episodes,
+            "updates": progress.updates,
+            **self.window.summary(),
+            **{
+                key: float(value) / max(self._count, 1) for key, value in sorted(self._sums.items())
+            },
+        }
+        for group in self.learner.optimizer.param_groups:
+            row[f"lr_{group['name']}"] = group["lr"]
+        self._sums, self._count = {}, 0
+        self.metrics.write(row)
+        seconds = self.clock.seconds
+        self.timing.write({"frames": progress.frames, "updates": progress.updates, **seconds})
+        self._log(row)

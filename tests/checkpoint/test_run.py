@@ -1,0 +1,218 @@
+"""Checkpoints: whole, atomic, without pickle."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import OmegaConf
+from small import EMPTY, SMALL, compose
+from tensordict import TensorDict
+from torchrl.checkpoint import Checkpoint
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+
+from saferl.algorithms.assemble import build_agent, build_trainer, load_agent
+from saferl.checkpoint.run import CONFIG, EXPORTED, RunCheckpoint, export, latest, run_folder
+from saferl.checkpoint.state import BufferState, Fitting, GrowingFiles
+from saferl.config.locate import pretrained_run
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of RSAC without its test episodes."""
+    folder = tmp_path_factory.mktemp("run")
+    cfg = compose(*SMALL, *EMPTY, "algo=rsac", "task.duration=2")
+    build_trainer(cfg, folder).train()
+    OmegaConf.save(cfg, folder / CONFIG, resolve=True)
+    return folder
+
+
+def test_no_file_is_pickled(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Neither by its name, nor by what it holds, nor when it is read."""
+    for path in run.rglob("checkpoints/**/*"):
+        assert path.suffix not in (".pkl", ".pt", ".pth", ".t", ".pickle")
+        if path.is_file() and path.suffix != ".memmap":
+            json.loads(path.read_text())
+
+    def refuse(*args, **kwargs):
+        raise AssertionError("pickle was used")
+
+    for module, name in ((pickle, "load"), (pickle, "loads"), (torch, "load")):
+        monkeypatch.setattr(module, name, refuse)
+    cfg = compose(*SMALL, *EMPTY, "algo=rsac", "task.duration=2")
+    trainer = build_trainer(cfg, run)
+    trainer.resume()
+    assert trainer.progress.frames == 24
+
+
+def test_everything_is_in_it(run: Path):
+    """A peer's checkpoint held the actor alone (docs/pitfalls.md, 13)."""
+    assert set(Checkpoint.manifest(latest(run))["components"]) == {
+        "buffer", "clock", "collector", "files", "loss", "optimizer", "progress", "record", "rng",
+        "window",
+    }  # fmt: skip
+    agent = build_agent(compose(*SMALL, *EMPTY, "algo=rsac"))
+    names = {name.split(".")[0] for name in agent.loss.state_dict()}
+    assert {
+        "actor_network_params", "qvalue_network_params", "target_qvalue_network_params",
+        "cost_critic_params", "target_cost_critic_params", "log_alpha", "lagrange",
+    } <= names  # fmt: skip
+
+
+def test_a_failed_write_leaves_the_last_checkpoint(tmp_path: Path):
+    class Part:
+        broken = False
+
+        def state_dict(self):
+            if self.broken:
+                raise OSError("disk full")
+            return {"value": torch.tensor(1.0)}
+
+        def load_state_dict(self, state):
+            self.loaded = state
+
+    part = Part()
+    checkpoint = RunCheckpoint(tmp_path, part=part)
+    checkpoint.save(1, {})
+    part.broken = True
+    with pytest.raises(OSError, match="disk full"):
+        checkpoint.save(2, {})
+    assert latest(tmp_path).name.endswith("1")
+    assert len(list((tmp_path / "checkpoints").iterdir())) == 1
+
+    # What a SIGKILL leaves half written is neither read nor kept.
+    leftover = tmp_path / "checkpoints/.checkpoint-000000000009.stage-0123"
+    (leftover / "components").mkdir(parents=True)
+    checkpoint.load_latest()
+    assert part.loaded["value"] == 1.0 and not leftover.exists()
+
+
+def test_the_newest_replaces_the_older(tmp_path: Path):
+    checkpoint = RunCheckpoint(tmp_path, part=GrowingFiles())
+    for frames in (5, 10):
+        checkpoint.save(frames, {})
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == [latest(tmp_path).name]
+    assert latest(tmp_path).name.endswith("10")
+
+
+@pytest.mark.parametrize("written", [0, 3, 14])
+def test_buffer_continues_where_it_was(written: int):
+    """Empty, partly filled and wrapped round: same rows, same next samples, same next writes."""
+
+    def buffer() -> TensorDictReplayBuffer:
+        return TensorDictReplayBuffer(
+            storage=LazyTensorStorage(8), batch_size=4, generator=torch.Generator().manual_seed(1)
+        )
+
+    def transitions(start: int, count: int):
+        values = torch.arange(start, start + count)
+        return TensorDict({"x": values, "next": {"y": values[:, None] > 2}}, [count])
+
+    ours, theirs = buffer(), buffer()
+    for index in range(written):
+        ours.extend(transitions(index, 1))
+    if written:
+        ours.sample()
+    BufferState(theirs).load_state_dict(BufferState(ours).state_dict())
+    assert len(ours) == len(theirs) == min(written, 8)
+    for each in (ours, theirs):
+        each.extend(transitions(100, 3))
+    assert (ours[:] == theirs[:]).all()
+    assert (ours.sample() == theirs.sample()).all()
+
+
+def test_buffer_too_small_is_refused():
+    ours = TensorDictReplayBuffer(storage=LazyTensorStorage(8), batch_size=1)
+    ours.extend(TensorDict({"x": torch.zeros(6)}, [6]))
+    small = TensorDictReplayBuffer(storage=LazyTensorStorage(4), batch_size=1)
+    with pytest.raises(ValueError, match="buffer_size must be >= 6"):
+        BufferState(small).load_state_dict(BufferState(ours).state_dict())
+
+
+def test_files_return_to_what_they_were(tmp_path: Path):
+    early, late = tmp_path / "early.csv", tmp_path / "late.csv"
+    early.write_bytes(b"a\r\n1\r\n")
+    files = GrowingFiles(early, late)
+    state = files.state_dict()
+    early.write_bytes(b"a,b\n1,\n2,3\n")  # a new column rewrote the header
+    late.write_bytes(b"c\n")
+    files.load_state_dict(state)
+    assert early.read_bytes() == b"a\r\n1\r\n" and not late.exists()
+
+
+def test_another_architecture_names_the_parameter_and_the_way_out(run: Path):
+    wide = compose(*SMALL, *EMPTY, "algo=rsac", "encoder.policy.width=24")
+    with pytest.raises(ValueError) as refused:
+        load_agent(wide, run, "checkpoint")
+    message = str(refused.value)
+    for part in ("actor_network_params", "[16]", "[24]", "more)", "config.yaml", str(run)):
+        assert part in message
+    with pytest.raises(ValueError, match=r"cost_critic_params.* in the checkpoint and absent here"):
+        load_agent(compose(*SMALL, *EMPTY, "algo=sac"), run, "checkpoint")
+
+
+def test_fitting_counts_differences():
+    ours = Fitting(torch.nn.Linear(2, 3), "critic")
+    state = torch.nn.Linear(2, 4).state_dict() | {"extra": torch.zeros(1)}
+    with pytest.raises(
+        ValueError, match=r"another critic: bias is \[4\] .* \[3\] here \(and 2 more"
+    ):
+        ours.load_state_dict(state)
+
+
+def test_folders(run: Path, tmp_path: Path):
+    point = latest(run)
+    assert latest(point) == point
+    assert run_folder(run) == run and run_folder(point) == run
+    with pytest.raises(FileNotFoundError, match="init: no such file or folder"):
+        latest(tmp_path / "none", "init")
+    with pytest.raises(FileNotFoundError, match="holds no checkpoint"):
+        latest(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"no config\.yaml"):
+        run_folder(tmp_path)
+    # The configuration of an outer folder is somebody else's.
+    (tmp_path / CONFIG).touch()
+    (tmp_path / "inner").mkdir()
+    with pytest.raises(FileNotFoundError, match=r"no config\.yaml"):
+        run_folder(tmp_path / "inner")
+
+
+def test_a_run_is_newer_than_a_policy_beside_it(run: Path, tmp_path: Path):
+    shutil.copytree(run, tmp_path / "run")
+    policy = export(run, tmp_path / "policy")
+    shutil.copy(policy / EXPORTED, tmp_path / "run")
+    assert latest(tmp_path / "run").parent == tmp_path / "run/checkpoints"
+
+
+def test_export_destroys_nothing(run: Path, tmp_path: Path):
+    """Neither the run that it reads nor a policy that is there."""
+    before = (run / CONFIG).read_bytes()
+    with pytest.raises(ValueError, match=f"out: {run} holds a run or a policy already"):
+        export(run, run)
+    assert (run / CONFIG).read_bytes() == before and not (run / EXPORTED).exists()
+    policy = export(run, tmp_path / "policy")
+    with pytest.raises(ValueError, match=f"out: {policy} holds a run or a policy already"):
+        export(run, policy)
+
+
+def test_export_holds_the_networks_alone_and_drives_the_same(run: Path, tmp_path: Path):
+    folder = export(run, tmp_path / "shipped" / "gs")
+    assert {path.name for path in folder.iterdir()} == {CONFIG, EXPORTED}
+    assert set(Checkpoint.manifest(folder / EXPORTED)["components"]) == {"loss", "progress"}
+    assert str(run) not in (folder / CONFIG).read_text()
+
+    cfg = compose(*SMALL, *EMPTY, "algo=rsac")
+    ours, theirs = load_agent(cfg, run, "x"), load_agent(cfg, folder, "x")
+    state = theirs.loss.state_dict()
+    assert all(
+        torch.equal(value, state[key])
+        for key, value in ours.loss.state_dict().items()
+        if isinstance(value, torch.Tensor)
+    )
+    assert pretrained_run("gs", root=tmp_path / "shipped") == folder
+    with pytest.raises(ValueError, match="pretrained must be one of gs, got 'lt'"):
+        pretrained_run("lt", root=tmp_path / "shipped")

@@ -1,0 +1,409 @@
+"""The commands as a user types them."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import time
+from pathlib import Path
+
+import hydra
+import pytest
+import torch
+from omegaconf import OmegaConf
+from small import EMPTY, SMALL, compose
+
+from saferl.algorithms.assemble import build_agent, build_trainer, load_agent
+from saferl.checkpoint.run import CONFIG, run_config
+from saferl.evaluation.compare import main as summarise
+from saferl.training.trainer import _interrupts
+
+TRAIN, TEST, EXPORT = ("train", "config"), ("evaluate", "evaluate"), ("export", "export")
+
+MISTAKES = [
+    (TRAIN, "algo=foo", "algo must be one of arppo, arsac, arsac_plus, arsac_signed, asac, cpo, "),
+    (TRAIN, "task=foo", "task must be one of cart, gs, gym, lt, mixed, rt, got 'foo'"),
+    (TRAIN, "encoder=foo", "encoder must be one of mlp, mlp_tanh, mmam, set, got 'foo'"),
+    (TRAIN, "env=foo", "env must be one of batched, cart, gym, highway, got 'foo'"),
+    (TRAIN, "experiment=foo", "quickstart"),
+    (TRAIN, "gama=0.9", "unknown key 'gama' (did you mean gamma?); choose from algo_name, "),
+    (
+        TRAIN,
+        "task.vehicels=3",
+        "unknown key 'task.vehicels' (did you mean vehicles?); choose from task",
+    ),
+    (TRAIN, "task.cost.steps=3", "set it with +task.cost.steps"),
+    (TRAIN, "+task.foo=1", "unknown key task.foo: "),
+    (TRAIN, "+foo=1", "unknown key foo; choose from "),
+    (TRAIN, "gamma", "Error parsing override 'gamma'"),
+    (TRAIN, "gamma=1.2", "gamma must be >= 0 and <= 1, got 1.2"),
+    (TRAIN, "gamma=abc", "gamma must be a number, got 'abc'"),
+    (TRAIN, "gamma=nan", "got nan"),
+    (TRAIN, "cost_limit=-1", "cost_limit must be >= 0, got -1"),
+    (TRAIN, "episodes=0", "episodes must be >= 1, got 0"),
+    (TRAIN, "frames=null", "Give one budget, episodes or frames"),
+    (TRAIN, "episodes=5 frames=10000", "Give one budget, episodes or frames"),
+    (TRAIN, "device=foo", "device must be one of auto, cpu, cuda, got 'foo'"),
+    (TRAIN, "seed=-1", "seed must be >= 0, got -1"),
+    (TRAIN, "learning.lr.actor=0.1", "learning.lr.actor must be a list, got "),
+    (
+        TRAIN,
+        "learning.lr.actor=[1e-3,-1]",
+        "lr.actor must be [first, last], both >= 0, got [0.001, -1.0]",
+    ),
+    (TRAIN, "learning.updates_per_frame=-1", "updates_per_frame must be > 0, got -1.0"),
+    (
+        TRAIN,
+        "learning.buffer_size=10",
+        "buffer_size must be >= learning.batch_size, got 10 and 256",
+    ),
+    (TRAIN, "episodes=null frames=50", "warmup_frames must be <= frames, or nothing is learned"),
+    (TRAIN, "+loss.alpha_init=1", "loss.alpha_init cannot be set: it follows from the rest"),
+    (TRAIN, "algo=sac_lag +env.seed=5", "env.seed cannot be set: it follows from the rest"),
+    (TRAIN, "lagrange.signal.cost_limit=1", "saferl.training.signals.CriticSignal takes nothing"),
+    (TRAIN, "+lagrange.signal.cost_limit=1", "unknown key lagrange.signal.cost_limit"),
+    (TRAIN, "algo=ppo_rs task=cart", "which task=cart has not: set shaping=none"),
+    (TRAIN, "learning.alpha_init=0", "alpha_init must be > 0, got 0.0"),
+    (TRAIN, "evaluation.episodes=0", "evaluation.episodes must be >= 1, got 0"),
+    (TRAIN, "evaluation.drivers=[blind,fast]", "must be among random, blind, scripted, got 'fast'"),
+    (
+        TRAIN,
+        "algo=sac task=cart evaluation.gif=1",
+        "evaluation.gif must be 0, as task=cart draws no pictures, got ",
+    ),
+    (TRAIN, "lagrange.multiplier.lr=0", "lr must be finite and > 0, got 0"),
+    (TRAIN, "task.observation=map", "observation must be one of route, world, got 'map'"),
+    (TRAIN, "task.cost.crash=-1", "cost.crash must be >= 0, got -1"),
+    (TRAIN, "projector.step_size=-1", "step_size must be finite and > 0, got -1"),
+    (TRAIN, "task.reward.reading=foo", "reading must be one of normalised, raw, got 'foo'"),
+    (TRAIN, "task.vehicles=abc", "task.vehicles must be a whole number or null, got 'abc'"),
+    (TRAIN, "env.num_envs=abc", "env.num_envs must be a whole number, got 'abc'"),
+    (TRAIN, "encoder.policy.heads=3", "width must be a multiple of heads, got 32 and 3"),
+    (TRAIN, "lagrange.multiplier.lr=-1", "lr must be finite and > 0, got -1"),
+    (TRAIN, "loss=sac", "takes no cost_critic: set cost_critic=none, or another loss"),
+    (TRAIN, "algo=sac loss=sac_lag", "needs cost_critic, got cost_critic=none"),
+    (TRAIN, "algo=sac projector=gradient", "projector needs cost critics"),
+    (TRAIN, "algo=cpo projector=gradient", "projector needs cost critics Q_c(s, a), which"),
+    (TRAIN, "algo=cpo lagrange=episode", "takes no lagrange: set lagrange=none"),
+    (TRAIN, "algo=cpo learning=off_policy", "OffPolicy learns by losses with a qvalue_network"),
+    (
+        TRAIN,
+        "algo=ppo task=cart learning.rollout_frames=100",
+        "batch_size must be <= 128, the frames of a batch",
+    ),
+    (TRAIN, "algo=ppo learning.rollout_frames=9 env.num_envs=9", "must be <= 9, the frames of a"),
+    (TRAIN, "algo=ppo_lag +loss.clip_epsilom=0.3", "unknown key loss.clip_epsilom"),
+    (TRAIN, "algo=cpo +loss.dampin=3", "unknown key loss.dampin"),
+    (TRAIN, "algo=cpo loss.trust=abc", "loss.trust must be a number, got 'abc'"),
+    (TRAIN, "task=cart task.horizon=0", "task.horizon must be >= 1, got 0"),
+    (
+        TEST,
+        "policy=random task=cart",
+        "policy must be among none: task=cart has no drivers, got 'random'",
+    ),
+    (TRAIN, "algo=ppo critic=twin", "has one state value: set critic=single, got 2 members"),
+    (TRAIN, "algo=ppo_lag lagrange=signed", "CriticSignal needs Q_c(s, a), which PPOLagLoss has"),
+    (TRAIN, "algo=sac risk=mean_std", "SACLoss takes no risk: set risk=none"),
+    (TRAIN, "risk=mean_std cost_critic.members=1", "risk=mean_std is of several members"),
+    (
+        TRAIN,
+        "algo=sac_lag task=cart learning.demonstrations=9",
+        "which task=cart has not: set learning.demonstrations=0",
+    ),
+    (
+        TRAIN,
+        "algo=ppo learning.rollout_frames=abc",
+        "learning.rollout_frames must be a whole number, got 'abc'",
+    ),
+    (TRAIN, "algo=ppo env.num_envs=0", "env.num_envs must be >= 1, got 0"),
+    (TRAIN, "env=cart", "plays a Cart, but task=gs is a Scenario: leave env= to the task"),
+    (TRAIN, "task=gym", "Missing mandatory value: task.id"),
+    (TRAIN, "algo=sac task=gym task.id=No-v0", "task.id: No-v0 cannot be made"),
+    (TRAIN, "resume=missing", "resume: no such file or folder: missing"),
+    (TRAIN, "resume=2025", "resume: no such file or folder: 2025"),
+    (TRAIN, "init=missing", "init: no such file or folder: missing"),
+    (TRAIN, "out=", "out must be a path, got ''"),
+    (TRAIN, "resume=", "resume must be a path, got ''"),
+    (TRAIN, "init=", "init must be a path, got ''"),
+    (
+        TEST,
+        "",
+        "Give one of checkpoint=PATH, pretrained=NAME or policy=random|blind|scripted, got none",
+    ),
+    (TEST, "policy=blind checkpoint=x", "got checkpoint=x and policy=blind"),
+    (TEST, "policy=foo", "policy must be among random, blind, scripted, got 'foo'"),
+    (TEST, "pretrained=foo", "pretrained"),
+    (TEST, "checkpoint=missing", "checkpoint: no such file or folder: missing"),
+    (TEST, "policy=blind episodes=0", "episodes must be >= 1, got 0"),
+    (TEST, "policy=blind task=foo", "task must be one of cart, gs, gym, lt, mixed, rt, got 'foo'"),
+    (TEST, "policy=blind foo=1", "unknown key 'foo'; choose from task, env, checkpoint"),
+    (TEST, "policy=blind out=", "out must be a path, got ''"),
+    (TEST, "checkpoint=", "checkpoint must be a path, got ''"),
+    (EXPORT, "", "checkpoint=... is missing"),
+    (EXPORT, "checkpoint=x out=", "out must be a path, got ''"),
+    (EXPORT, "checkpoint=missing out=x", "checkpoint: no such file or folder: missing"),
+]
+
+
+@pytest.mark.parametrize(
+    ("command_name", "arguments", "message"), MISTAKES, ids=[f"{m[0][0]} {m[1]}" for m in MISTAKES]
+)
+def test_mistake_is_one_line_and_leaves_nothing(
+    command_name, arguments, message, refusal, tmp_path: Path
+):
+    line = refusal(*command_name, *arguments.split())
+    assert message in line
+    assert not list(tmp_path.iterdir())
+
+
+def test_missing_logger_is_named(refusal, monkeypatch):
+    """Whether or not W&B is installed here."""
+
+    def instantiate(node, **kwargs):
+        if "Wandb" in str(node.get("_target_")):
+            raise ImportError("wandb could not be imported")
+        return real(node, **kwargs)
+
+    real = hydra.utils.instantiate
+    monkeypatch.setattr(hydra.utils, "instantiate", instantiate)
+    line = refusal(*TRAIN, "logger=wandb", "encoder.policy.width=16")
+    assert "WandbLogger needs a package that is not installed" in line and "pip install" in line
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished run of SAC on an empty road."""
+    folder = tmp_path_factory.mktemp("run")
+    cfg = compose(*SMALL, *EMPTY, "algo=sac", "task.rows=2")
+    build_trainer(cfg, folder).train()
+    OmegaConf.save(cfg, folder / CONFIG, resolve=True)
+    return folder
+
+
+def test_a_run_is_not_written_over_nor_reconfigured(run: Path, refusal):
+    assert "holds a run already; continue it with resume=" in refusal(*TRAIN, f"out={run}")
+    line = refusal(*TRAIN, f"resume={run}", "gamma=0.9", "out=x")
+    assert "takes no other option, got gamma=0.9, out=x" in line
+    line = refusal(*TRAIN, *SMALL, *EMPTY, f"init={run}", "algo=sac", "encoder.policy.width=24")
+    assert "task.rows is 2 there and 11 here, encoder.policy.width is 16 there and 24 here" in line
+    assert "task.rows must be 2" in refusal(*TEST, f"checkpoint={run}", "task.rows=3")
+
+
+@pytest.mark.parametrize("algo", ["sac", "rsac"])
+def test_init_begins_from_the_networks_alone(algo: str, run: Path, tmp_path: Path):
+    """Of a run without cost critics too; the settings are those of the new configuration."""
+    options = (
+        "gamma=0.5",
+        "cost_limit=0.3",
+        "learning.alpha_init=0.7",
+        "learning.target_entropy=-1",
+    )
+    new = compose(*SMALL, *EMPTY, f"algo={algo}", "task.rows=2", "seed=9", *options, f"init={run}")
+    trainer = build_trainer(new, tmp_path)
+    ours = trainer.learner.loss.state_dict()
+    theirs = load_agent(run_config(run), run, "x").loss.state_dict()
+    fresh = build_agent(new).loss.state_dict()
+    for name in (key for key in ours if isinstance(ours[key], torch.Tensor)):
+        if "network_params" in name:  # a new run's targets begin as copies of the networks
+            assert (ours[name] == theirs[name.removeprefix("target_")]).all(), name
+        elif "cost_critic_params" not in name:  # these begin at random
+            assert (ours[name] == fresh[name]).all(), name
+    assert float(ours["log_alpha"].exp()) == pytest.approx(0.7)
+    assert ours["_value_estimator.gamma"] == 0.5
+    assert algo == "sac" or ours["cost_limit"] == pytest.approx(0.3)
+    assert trainer.progress.frames == 0 and trainer.collector.init_random_frames == 0
+
+
+def test_init_among_on_policy_algorithms(tmp_path: Path, refusal):
+    """Both values are taken over; weights that were trained with another activation are not."""
+    first = tmp_path / "first"
+    cfg = compose(*SMALL, "algo=ppo_lag", "task=cart")
+    build_trainer(cfg, first).train()
+    OmegaConf.save(cfg, first / CONFIG, resolve=True)
+    theirs = load_agent(run_config(first), first, "x").loss.state_dict()
+    options = ("algo=cpo", "encoder=mlp_tanh", "task=cart", "seed=9", f"init={first}")
+    ours = build_trainer(compose(*SMALL, *options), tmp_path / "x").learner.loss.state_dict()
+    networks = [key for key in ours if "_params." in key and "target_" not in key]
+    assert {key.split(".")[0] for key in networks} == {
+        "actor_network_params", "critic_network_params", "cost_critic_params"
+    }  # fmt: skip
+    for key in networks:
+        assert not isinstance(ours[key], torch.Tensor) or torch.equal(ours[key], theirs[key]), key
+    for algo in ("cpo", "sac"):
+        line = refusal(*TRAIN, *SMALL, f"algo={algo}", "task=cart", f"init={first}")
+        assert "do not fit: encoder.policy." in line and "torch.nn.Tanh" in line
+
+
+def test_a_test_does_not_change_a_task_that_is_not_the_roads(tmp_path: Path, refusal):
+    run = tmp_path / "run"
+    cfg = compose(*SMALL, "algo=sac", "task=cart")
+    build_trainer(cfg, run).save()
+    OmegaConf.save(cfg, run / CONFIG, resolve=True)
+    for option, words in (
+        ("task=lt", "task: this policy's task is cart, which a test does not change"),
+        ("task.scenario=dense", "task.scenario: this policy's task is cart"),
+        ("gif=1", "gif must be 0, as task=cart draws no pictures, got 1"),
+    ):
+        assert words in refusal(*TEST, f"checkpoint={run}", option, "episodes=2", "out=test")
+    assert not (tmp_path / "test").exists()
+
+
+def test_init_of_another_algorithm(run: Path, tmp_path: Path, refusal):
+    """SAC begun from a constrained run; an MLP from attention is refused by the options."""
+    constrained = tmp_path / "constrained"
+    cfg = compose(*SMALL, *EMPTY, "algo=rsac", "task.rows=2")
+    build_trainer(cfg, constrained).save()
+    OmegaConf.save(cfg, constrained / CONFIG, resolve=True)
+    trainer = build_trainer(
+        compose(*SMALL, *EMPTY, "algo=sac", "task.rows=2", f"init={constrained}"), tmp_path / "x"
+    )
+    ours, theirs = trainer.learner.loss, load_agent(cfg, constrained, "x").loss
+    assert (ours.actor_network_params == theirs.actor_network_params).all()
+
+    options = (*TRAIN, *SMALL, *EMPTY, "algo=rsac", "task.rows=2", f"init={constrained}")
+    for option, told in (
+        ("critic.layer_norm=true", "critic.layer_norm is False there and True here."),
+        ("cost_critic=quantile", "cost_critic.outputs is 1 there and 16 here."),
+        ("critic=ensemble", "critic.members is 2 there and 4 here."),
+    ):
+        assert f"do not fit: {told}" in refusal(*options, option)
+
+    line = refusal(*TRAIN, *SMALL, *EMPTY, f"init={run}", "algo=asac", "task.rows=3")
+    assert "task.rows is 2 there and 3 here" in line
+    assert "encoder.policy._target_ is saferl.modules.MLPPolicyEncoder there and" in line
+
+
+def test_train_from_any_folder_then_multirun(command, tmp_path: Path, capsys):
+    command(*TRAIN, *SMALL, *EMPTY, "algo=sac", "out=mine", "logger=tensorboard")
+    names = {path.name for path in (tmp_path / "mine").iterdir()}
+    assert names == {
+        "checkpoints", "config.yaml", "evaluation", "metrics.csv", "tensorboard", "timing.csv",
+    }  # fmt: skip
+    assert {path.name for path in tmp_path.iterdir()} == {"mine"}
+    assert "SR" in capsys.readouterr().out
+
+    command(*TRAIN, "-m", *SMALL, *EMPTY, "algo=sac,asac", "seed=0,1", "frames=8", "out=many")
+    jobs = sorted(path for path in (tmp_path / "many").iterdir() if path.is_dir())
+    assert [job.name for job in jobs] == ["0", "1", "2", "3"]
+    made = [(job / CONFIG).read_text() for job in jobs]
+    assert ["algo_name: sac\n" in text for text in made] == [True, True, False, False]
+    assert [f"seed: {seed}\n" in text for seed, text in zip((0, 1, 0, 1), made, strict=True)] == [
+        True
+    ] * 4
+    assert all((job / "evaluation/metrics.json").is_file() for job in jobs)
+    summary = capsys.readouterr().out.splitlines()[-3:]
+    summarise(["many"])
+    assert capsys.readouterr().out.splitlines() == summary
+    with pytest.raises(SystemExit, match="no run below elsewhere has been tested"):
+        summarise(["elsewhere"])
+    assert summary[0].split() == ["runs", "SR", "%", "CR", "%", "return", "cost", "return"]
+    for line, algo in zip(summary[1:], ("sac", "asac"), strict=True):
+        assert re.match(algo + r" gs +2 +\S+ \[\S+, \S+\]  ", line)
+
+
+def test_run_folder_has_a_name_that_shells_like(command, tmp_path: Path):
+    command(*TRAIN, *SMALL, *EMPTY, "algo=sac", "frames=8", "seed=3")
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert folder.name == "sac-gs-seed3"
+    (run,) = folder.iterdir()
+    assert "=" not in str(run.relative_to(tmp_path)) and (run / "metrics.csv").is_file()
+
+
+@pytest.mark.parametrize("policy", ["random", "blind", "scripted"])
+def test_evaluate_a_driver(policy: str, command, tmp_path: Path):
+    command(*TEST, f"policy={policy}", *EMPTY, "episodes=3", "seed=2", "task=rt", "out=there")
+    figures = json.loads((tmp_path / "there/metrics.json").read_text())
+    for name in (
+        "collision_rate", "success_rate", "frozen_rate", "return", "speed", "cost_return",
+        "intervention_rate",
+    ):  # fmt: skip
+        assert set(figures[name]) == {"mean", "low", "high"}
+        assert figures[name]["low"] <= figures[name]["mean"] <= figures[name]["high"]
+        assert not name.endswith("_rate") or 0 <= figures[name]["low"] <= figures[name]["high"] <= 1
+    assert figures["success_rate"]["mean"] == (0.0 if policy == "random" else 1.0)
+    assert (tmp_path / "there/episodes.csv").read_text().count("\n") == 4
+
+
+def test_help_lists_groups_and_settings(command, capsys):
+    with pytest.raises(SystemExit) as left:
+        command(*TRAIN, "--help")
+    assert not left.value.code
+    text = capsys.readouterr().out
+    assert "python -m saferl algo=arsac task=gs" in text
+    assert (
+        "algo: arppo, arsac, arsac_plus, arsac_signed, asac, cpo, ppo" in text
+        and "gamma: 0.99" in text
+    )
+
+
+def test_the_readmes_everyday_commands_work_in_order(command, tmp_path: Path):
+    """With small budgets on an empty road, but otherwise as they stand there."""
+    readme = (Path(__file__).parents[2] / "README.md").read_text()
+    block = readme.partition("## Everyday commands")[2].split("```")[1]
+    lines = [line.partition("#")[0].split() for line in block.splitlines() if "-m saferl" in line]
+    assert len(lines) == 11
+    small = {"saferl": (*SMALL, *EMPTY), "saferl.evaluate": (*EMPTY, "episodes=1", "gif=0")}
+    for _, _, module, *arguments in lines:
+        name = module.partition(".")[2] or "train"
+        if "--help" in arguments:
+            continue
+        if name == "summary":
+            summarise(arguments)
+            continue
+        if not any(argument.startswith("resume=") for argument in arguments):
+            arguments += small.get(module, ())
+        command(name, "config" if name == "train" else name, *arguments)
+    assert (tmp_path / "test/metrics.json").is_file() and (tmp_path / "policy").is_dir()
+
+
+def test_interrupt_leaves_a_checkpoint_that_loads(spawn, tmp_path: Path):
+    """Ctrl-C once; exit 130 and a line that says how to go on, which then works."""
+    options = (*SMALL, *EMPTY, "algo=sac", "frames=1000000", "save_every=1000000", "out=run")
+    process = spawn("saferl", *options)
+    metrics = tmp_path / "run/metrics.csv"
+    while not metrics.exists() or metrics.read_text().count("\n") < 3:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=300)
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    assert "Continue with resume=" in err.splitlines()[-1]
+
+    trainer = build_trainer(compose(*options[:-1]), tmp_path / "run")
+    trainer.resume()
+    assert trainer.progress.updates > 0 and trainer.progress.frames >= 16
+    assert len(trainer.experience.buffer) == min(64, trainer.progress.frames)
+
+
+def test_interrupt_of_the_closing_test_tells_how_to_repeat_it(command, monkeypatch, capsys):
+    def interrupted(*args):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit) as left:
+        patch.setattr("saferl.cli.evaluate.play_episodes", interrupted)
+        command(*TRAIN, *SMALL, *EMPTY, "algo=sac", "out=run")
+    assert left.value.code == 130
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith("Interrupted in the closing test. Repeat it with resume=")
+    command(*TRAIN, line.split()[-1])
+    assert Path("run/evaluation/metrics.json").is_file()
+
+
+def test_second_interrupt_ends_at_once(tmp_path: Path):
+    """Even while a step lasts for ever; then the handler is what it was."""
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt, match="twice"), _interrupts() as received:
+        signal.raise_signal(signal.SIGINT)
+        assert received == [signal.SIGINT]
+        signal.raise_signal(signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_mistake_in_a_process_of_its_own(spawn, tmp_path: Path):
+    process = spawn("saferl", "gamma=1.2", "out=run")
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 1 and out == ""
+    assert err == "error: gamma must be >= 0 and <= 1, got 1.2.\n"
+    assert list(tmp_path.iterdir()) == []

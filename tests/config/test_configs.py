@@ -1,0 +1,316 @@
+"""Every option of every group composes, and every composition builds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import hydra
+import pytest
+import torch
+from omegaconf import OmegaConf
+from small import EMPTY, SMALL, compose
+
+from saferl.algorithms.assemble import build_agent, build_trainer
+from saferl.cli.evaluate import on_its_own_task
+from saferl.config.check import arguments, check, fits
+from saferl.config.locate import config_dir
+from saferl.modules import MeanStd, MLPPolicyEncoder, MMAMPolicyEncoder
+
+ROOT = Path(config_dir())
+OPTIONS = sorted(
+    f"{path.parent.name}={path.stem}"
+    for path in ROOT.glob("*/*.yaml")
+    if path.parent.name not in ("hydra", "recipe")
+)
+ALGOS = sorted(path.stem for path in (ROOT / "algo").glob("*.yaml"))
+#: What an option needs beside it.
+BESIDE = {"task=gym": ("task.id=Pendulum-v1", "task.cost_key=null")}
+#: Encoder, cost critics, multiplier's signal, projector, r_safe: the table of the paper.
+PARTS = {
+    "arsac": (MMAMPolicyEncoder, 2, "CriticSignal", True, False),
+    "rsac": (MLPPolicyEncoder, 2, "CriticSignal", True, False),
+    "asac": (MMAMPolicyEncoder, 0, None, False, False),
+    "sac": (MLPPolicyEncoder, 0, None, False, False),
+    "sac_rs": (MLPPolicyEncoder, 0, None, False, True),
+    "sac_lag": (MLPPolicyEncoder, 2, "EpisodeSignal", False, False),
+}
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+def test_option_composes_and_is_checked(option: str):
+    """Each option, with the parts that it needs beside it, passes the check of what it says."""
+    check(compose(option, *BESIDE.get(option, ())))
+
+
+ROADS = {"task": ["gs", "lt", "mixed", "rt"], "env": ["batched", "highway"]}
+
+
+@pytest.mark.parametrize("option", [f"{group}={name}" for group in ROADS for name in ROADS[group]])
+def test_option_of_the_evaluation(option: str):
+    cfg = compose(option, config="evaluate")
+    check(cfg)
+    cfg = on_its_own_task(cfg, cfg, [option])
+    assert cfg.task.policy_frequency == 10 and cfg.task.route_starts == 0.0
+    assert cfg.task.standstill is None and not cfg.task.reward.get("risk_shaping", False)
+    assert {"checkpoint", "pretrained", "policy", "episodes", "seed", "out"} <= set(cfg)
+
+
+def test_help_of_the_evaluation_lists_its_choices():
+    template = OmegaConf.load(ROOT / "evaluate.yaml").hydra.help.template
+    for group, choices in ROADS.items():
+        assert f"{group}: {', '.join(choices)}\n" in template
+
+
+def test_every_file_is_an_option_of_a_known_group():
+    groups = {path.name for path in ROOT.iterdir() if path.is_dir()}
+    assert groups == {
+        "algo", "cost_critic", "critic", "encoder", "env", "experiment", "hydra", "lagrange",
+        "learning", "logger", "loss", "projector", "recipe", "risk", "shaping", "task",
+    }  # fmt: skip
+    assert not list(ROOT.rglob("__init__.py"))  # a package of YAML would be shipped as code
+    assert set(ALGOS) >= set(PARTS)
+
+
+def test_every_recipe_is_of_two_choices_that_there_are():
+    """A pair without a file changes nothing, so that a misspelt one would do nothing without a word."""
+    groups = {"task": ("task", "learning"), "experiment": ("experiment", "learning")}
+    for path in (ROOT / "recipe").glob("*/*.yaml"):
+        one, other = groups.get(path.parent.name, path.parent.name.split("_"))
+        pairs = {
+            f"{a.stem}_{b.stem}" for a in (ROOT / one).iterdir() for b in (ROOT / other).iterdir()
+        }
+        assert path.stem in pairs, path
+        defaults = OmegaConf.load(ROOT / "config.yaml").defaults
+        assert {f"optional recipe/{path.parent.name}": f"${{{one}}}_${{{other}}}"} in defaults
+
+
+#: What ARSAC refuses, and the reason.
+REFUSED = {
+    "cost_critic=none": "needs cost_critic, got cost_critic=none",
+    "env=cart": "plays a Cart, but task=gs is a Scenario",
+    "env=gym": "plays a GymTask, but task=gs is a Scenario",
+    "experiment=cart": "reads ego, vehicles, but task=cart observes observation",
+    "experiment=speed": "but task=gym observes observation|cannot be made: .*(No module|not installed)",
+    "learning=on_policy": "OnPolicy learns by losses with a critic_network, which .*SACLagLoss has not",
+    "lagrange=none": "needs lagrange, got lagrange=none",
+    **{
+        f"loss={name}": "OffPolicy learns by losses with a qvalue_network"
+        for name in ("cpo", "ppo", "ppo_lag", "ppo_risk")
+    },
+    "risk=none": "needs risk, got risk=none",
+    "loss=sac": "takes no cost_critic",
+    "risk=cvar": "risk=cvar is of quantiles: set cost_critic=quantile",
+    "task=cart": "reads ego, vehicles, but task=cart observes observation",
+    "task=gym": "reads ego, vehicles, but task=gym observes observation",
+}
+
+
+@pytest.mark.parametrize("option", [o for o in OPTIONS if not o.startswith("algo=")])
+def test_option_builds_or_is_refused_with_the_reason(option: str, tmp_path: Path):
+    """Each option of each group, one at a time, in place of ARSAC's own."""
+    cfg = compose(*SMALL, option, *BESIDE.get(option, ()))
+    if option in REFUSED:
+        with pytest.raises(ValueError, match=REFUSED[option]):
+            build_trainer(cfg, tmp_path)
+        return
+    build_trainer(cfg, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("algo=cpo", "+cost_critic.outputs=16"), "cost_critic.outputs is of action values"),
+        (("algo=ppo", "+critic.layer_norm=true"), "critic.layer_norm is of action values"),
+        (("algo=sac_lag", "loss.cost_backup=reach"), "EpisodeSignal limits the summed cost"),
+    ],
+)
+def test_an_option_that_nothing_would_read_is_refused(options, message: str, tmp_path: Path):
+    with pytest.raises(ValueError, match=message):
+        build_trainer(compose(*SMALL, *EMPTY, *options), tmp_path)
+
+
+@pytest.mark.parametrize("encoder", ["mmam", "mlp"])
+def test_critics_are_built_as_their_options_say(encoder: str):
+    """Also where an option equals another's usual value, as True does 1."""
+
+    def critics(*options: str):
+        loss = build_agent(compose(*SMALL, "algo=arsac", f"encoder={encoder}", *options)).loss
+        return loss.qvalue_network.module, loss.cost_critic.module
+
+    assert not any(critic.layer_norm for critic in critics())
+    for option in ("critic.layer_norm=true", "cost_critic.layer_norm=true"):
+        assert sum(critic.layer_norm for critic in critics(option)) == 1
+    plain, quantiles = critics("cost_critic=quantile")
+    scene = torch.zeros(3, 17), torch.zeros(3, 11, 14), torch.zeros(3, 2)
+    assert plain(*scene).shape == (3, 1) and quantiles(*scene).shape == (3, 16)
+
+
+@pytest.mark.parametrize("algo", ["sac_lag", "ppo_lag"])
+@pytest.mark.parametrize("lagrange", ["episode", "pid_episode"])
+def test_every_multiplier_of_episodes_goes_with_every_loss(algo, lagrange, tmp_path: Path):
+    cfg = compose(*SMALL, *EMPTY, f"algo={algo}", f"lagrange={lagrange}")
+    build_trainer(cfg, tmp_path).train()
+
+
+#: Ways to compose a task with its environment, small.
+TASKS = {
+    "batched": ("task=mixed", "env=batched", "task.vehicles=0"),
+    "lt": ("task=lt", "env=batched", "task.vehicles=0"),
+    "rt": ("task=rt", "env=batched", "task.vehicles=0"),
+    "highway": ("task=gs", "env=highway", "task.vehicles=3"),
+    "cart": ("task=cart",),
+    "gym": ("task=gym", *BESIDE["task=gym"]),
+}
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("algo", ALGOS)
+def test_algorithm_builds_and_makes_updates(algo: str, task: str, tmp_path: Path):
+    """On every kind of task, or it is refused with the reason."""
+    options = (f"algo={algo}", *TASKS[task], "frames=14")
+    cfg = compose(*SMALL, *options)
+    if task in ("cart", "gym"):
+        if cfg.task.get("reward"):
+            with pytest.raises(ValueError, match="set shaping=none"):
+                build_trainer(cfg, tmp_path)
+            return
+        if cfg.encoder.policy._target_.endswith(("MMAMPolicyEncoder", "SetPolicyEncoder")):
+            with pytest.raises(
+                ValueError, match="reads ego, vehicles, but task=.* set encoder=mlp"
+            ):
+                build_trainer(cfg, tmp_path)
+            return
+    trainer = build_trainer(cfg, tmp_path)
+    if task in ("lt", "rt"):  # trained as "mixed"
+        return
+    trainer.train()
+    assert trainer.progress.frames >= 12 and trainer.progress.updates >= 3
+    assert (tmp_path / "metrics.csv").read_text().count("\n") >= 2
+
+
+@pytest.mark.parametrize("algo", sorted(PARTS))
+def test_composition_is_the_papers(algo: str):
+    encoder, cost_critics, signal, projector, shaping = PARTS[algo]
+    cfg = compose(f"algo={algo}", "encoder.policy.width=16")
+    agent = build_agent(cfg)
+    assert cfg.algo_name == algo
+    assert isinstance(next(m for m in agent.actor.modules() if isinstance(m, encoder)), encoder)
+    assert cfg.cost_critic.members == cost_critics
+    assert hasattr(agent.loss, "lagrange") == (signal is not None)
+    assert signal is None or cfg.lagrange.signal._target_.endswith(signal)
+    assert (agent.projector is not None) == projector
+    assert cfg.task.reward.get("risk_shaping", False) == shaping
+
+
+def test_arsac_plus_is_arsac_with_another_risk():
+    ours, papers = compose("algo=arsac_plus"), compose("algo=arsac")
+    differ = {key for key in papers if ours[key] != papers[key]}
+    assert differ == {"algo_name", "cost_critic", "risk", "loss"}  # loss.risk is risk
+    assert isinstance(build_agent(ours).loss.risk, MeanStd) and ours.cost_critic.members == 4
+
+
+@pytest.mark.parametrize(
+    ("options", "limit"),
+    [
+        ((), 0.0874),
+        (("cost_limit=0.5",), 0.874),
+        (("gamma=1",), 0.05),
+        (("gamma=0",), 0.05 * 125),
+        (("task.duration=50", "task.policy_frequency=10"), 0.05 * 5 / (1 - 0.99**500)),
+        (("cost_limit=0.5", "lagrange.signal.cost_limit=0.2"), 0.2),
+    ],
+)
+def test_cost_limit_sets_the_episode_budget_of_sac_lag(options, limit: float):
+    """d = b (1 - g^T) / ((1 - g) T), unless the budget b itself is given."""
+    cfg = compose("algo=sac_lag", *options)
+    check(cfg)
+    signal = hydra.utils.instantiate(cfg.lagrange.signal)
+    assert signal.cost_limit == pytest.approx(limit, rel=1e-3)
+
+
+@pytest.mark.parametrize("option", [o for o in OPTIONS if o.startswith("experiment=")])
+@pytest.mark.parametrize("algo", ["arsac", "rsac", "sac", "cpo"])
+def test_preset_builds_with_either_kind_of_algorithm(option: str, algo: str, tmp_path: Path):
+    fast = ("encoder.policy.width=16", "logger=none", "compile=false", "threads=1")
+    cfg = compose(option, f"algo={algo}", *fast)
+    if option == "experiment=speed":
+        pytest.importorskip("mujoco")
+    if option in ("experiment=cart", "experiment=speed") and algo == "arsac":
+        with pytest.raises(ValueError, match="set encoder=mlp"):
+            build_trainer(cfg, tmp_path)
+        return
+    build_trainer(cfg, tmp_path)
+
+
+def test_command_line_beats_preset_beats_algorithm():
+    cfg = compose("experiment=quickstart", "algo=sac", "encoder=mmam", "episodes=7")
+    assert cfg.episodes == 7
+    assert cfg.encoder.policy._target_.endswith("MMAMPolicyEncoder")
+    assert cfg.env._target_.endswith("BatchedIntersection")
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("gama: 0.9", "unknown key gama in experiment/mine; did you mean gamma?"),
+        ("learning: {lr: {actr: [1, 2]}}", "unknown key learning.lr.actr in experiment/mine"),
+        ("evaluation: {episode: 1}", "unknown key evaluation.episode in experiment/mine"),
+        ("critic: {member: 2}", "unknown key critic.member in experiment/mine"),
+        ("gamma: high", "gamma must be a number, got 'high'"),
+    ],
+)
+def test_a_typo_in_a_preset_is_refused_as_it_is_composed(line, message, refusal, tmp_path: Path):
+    (tmp_path / "my/experiment").mkdir(parents=True)
+    (tmp_path / "my/experiment/mine.yaml").write_text(f"# @package _global_\n{line}\n")
+    assert message in refusal("train", "config", "--config-dir", "my", "experiment=mine")
+
+
+#: Settings that one family has and the other not, or a part that is not there.
+UNREAD = {
+    "sac": ("learning.gae_lambda=0.1", "learning.rollout_frames=77", "learning.epochs=3",
+            "loss.cost_target=max", "lagrange.multiplier.lr=1", "projector.steps=3", "cost_critic.size=3"),
+    "ppo": ("learning.tau=0.5", "learning.updates_per_frame=3", "learning.alpha_init=9",
+            "learning.buffer_size=5000", "learning.lr.alpha=[1,1]", "loss.cost_limit=1", "tau=0.5"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("algo", "option"), [(a, o) for a, options in UNREAD.items() for o in options]
+)
+def test_a_setting_that_nothing_would_read_does_not_compose(algo: str, option: str, refusal):
+    assert "unknown key" in refusal("train", "config", f"algo={algo}", option)
+
+
+def test_a_typo_in_a_preset_is_refused():
+    """Hydra lets files add keys; only the check can tell."""
+    for key, value, message in (
+        ("encoder.value.depht", 3, r"unknown key encoder.value.depht: .* takes .*width"),
+        ("task.vehicels", 3, "unknown key task.vehicels: .*Scenario takes task, vehicles"),
+        ("loss.cost_limits", 3, "unknown key loss.cost_limits"),
+        ("projector.step_size", "0.02 rad", "projector.step_size must be a number, got '0.02 rad'"),
+        ("task.reward.weights", [1, "x"], "task.reward.weights must be a list, each a number"),
+        ("task.standstill", "never", "task.standstill must be a number or null, got 'never'"),
+        ("encoder.policy._target_", "saferl.Nothing", "'saferl.Nothing'"),
+    ):
+        cfg = compose()
+        OmegaConf.set_struct(cfg, False)
+        OmegaConf.update(cfg, key, value)
+        with pytest.raises(ValueError, match=message):
+            check(cfg)
+
+
+def test_kinds():
+    assert fits(1, float) and fits(1.5, float) and not fits(1.5, int) and not fits(True, float)
+    assert (
+        fits(None, float | None) and not fits("x", float | None) and fits([1, 2], tuple[float, ...])
+    )
+    assert "num_envs" in arguments("saferl.envs.intersection.HighwayIntersection")
+
+
+@pytest.mark.parametrize("members", [1, 2, 4])
+def test_any_number_of_critics_is_trained(members: int):
+    loss = build_agent(
+        compose("algo=rsac", *SMALL, f"critic.members={members}", f"cost_critic.members={members}")
+    ).loss
+    trained = {name.split(".")[0] for name, _ in loss.named_parameters()}
+    assert {"actor_network_params", "qvalue_network_params", "cost_critic_params"} <= trained
