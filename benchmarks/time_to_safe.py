@@ -40,7 +40,7 @@ from hydra import compose, initialize_config_dir
 from side_by_side import belongs, write
 
 from saferl.algorithms.assemble import build_env, build_trainer
-from saferl.algorithms.base import make
+from saferl.algorithms.parts import make
 from saferl.cli.evaluate import compiling
 from saferl.cli.train import claim
 from saferl.config.locate import config_dir

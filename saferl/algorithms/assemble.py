@@ -14,7 +14,8 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, RewardSum, Transform, TransformedEnv
 from torchrl.envs.transforms import Compose
 
-from saferl.algorithms.base import Agent, Algorithm, Parts, make
+from saferl.algorithms.base import Agent, Algorithm
+from saferl.algorithms.parts import Parts, make
 from saferl.checkpoint.run import FOLDER, latest, load_component, run_config
 from saferl.checkpoint.state import Fitting, Networks
 from saferl.config.check import arguments, check, check_targets, check_task

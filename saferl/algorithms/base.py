@@ -1,24 +1,23 @@
-"""From settings to an agent: the networks, loss and projector of one composition."""
+"""A family of algorithms, and the agents that it builds from a composition's parts."""
 
 from __future__ import annotations
 
-import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import hydra
 import torch
-from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, Transform
 from torchrl.objectives import LossModule
 
-from saferl.config.check import arguments
+from saferl.algorithms.networks import NetworkBuilder, critic_options
+from saferl.algorithms.parts import Parts, make
 from saferl.envs.task import Task
 from saferl.envs.transforms import SafetyProjector
-from saferl.modules import CVaR, MeanStd, tanh_gaussian_actor, value_operator, zero_output
+from saferl.modules import CVaR, MeanStd
 from saferl.training.learner import Learner
 from saferl.training.trainer import Experience
 
@@ -28,93 +27,11 @@ STORED = (
     *(("next", key) for key in ("reward", "cost", "done", "terminated")),
     ("next", "action_executed"),
 )
-#: Options of a critic of action values, and what they are where nothing is said.
-USUAL = {"outputs": 1, "layer_norm": False}
-
-
-def device_of(name: str) -> torch.device:
-    """A device by its name; ``auto`` is a GPU where there is one.
-
-    Raises:
-        ValueError: CUDA without a GPU.
-    """
-    if name == "cuda" and not torch.cuda.is_available():
-        raise ValueError("device=cuda, but torch sees no GPU; use device=cpu or auto.")
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    return torch.device(name)
-
-
-def make(node: DictConfig, settings: Mapping[str, Any] | None = None, **objects: Any) -> Any:
-    """Instantiate a node with live objects, which Hydra itself would turn into configurations.
-
-    Args:
-        node: with a ``_target_``.
-        settings: in place of the node's own.
-        **objects: arguments that the node may not set.
-
-    Raises:
-        ValueError: the node sets what the composition gives.
-    """
-    for key in set(node) & set(objects):
-        raise ValueError(
-            f"{node._get_full_key(key)} cannot be set: it follows from the rest of the configuration."
-        )
-    return hydra.utils.instantiate(node, _partial_=True, **(settings or {}))(**objects)
-
-
-def offered(node: DictConfig, task: Task) -> dict[str, Any]:
-    """What a task offers to a network and its configuration leaves open, as far as the network takes it."""
-    accepted = arguments(node._target_)
-    return {
-        key: value
-        for key, value in task.network.items()
-        if key not in node and (accepted is None or key in accepted)
-    }
-
-
-@dataclass(frozen=True)
-class Parts:
-    """What an algorithm is composed of: the nodes of a configuration, and the task.
-
-    Attributes:
-        task: what is learned.
-        encoder, critic, cost_critic, risk, loss, lagrange, projector: nodes of these groups.
-        gamma: discount.
-        device: of everything.
-    """
-
-    task: Task
-    encoder: DictConfig
-    critic: DictConfig
-    cost_critic: DictConfig
-    risk: DictConfig
-    loss: DictConfig
-    lagrange: DictConfig
-    projector: DictConfig
-    gamma: float
-    device: torch.device
-
-    @classmethod
-    def of(cls, cfg: DictConfig) -> Parts:
-        """The parts of a run's configuration."""
-        groups = ("encoder", "critic", "cost_critic", "risk", "loss", "lagrange", "projector")
-        return cls(
-            task=hydra.utils.instantiate(cfg.task),
-            gamma=cfg.gamma,
-            device=device_of(cfg.device),
-            **{group: cfg[group] for group in groups},
-        )
-
-    @property
-    def takes(self) -> set[str]:
-        """Names of what the loss is built from."""
-        return set(inspect.signature(hydra.utils.get_object(self.loss._target_)).parameters)
 
 
 @dataclass
 class Agent:
-    """NetworkBuilder and loss of one composition.
+    """Networks and loss of one composition.
 
     Attributes:
         actor: the policy.
@@ -128,90 +45,10 @@ class Agent:
     loss: LossModule
     projector: SafetyProjector | None
 
-
-class NetworkBuilder:
-    """Makes the networks of one agent, and remembers what they read.
-
-    Args:
-        parts: of the agent.
-    """
-
-    def __init__(self, parts: Parts):
-        self.parts = parts
-        self.observed: list[str] = []
-
-    def reads(self, network: Any) -> tuple[str, ...]:
-        """The keys that a network reads.
-
-        Raises:
-            ValueError: the task does not offer them.
-        """
-        keys, task = tuple(network.in_keys), self.parts.task
-        if not set(keys) <= set(task.observed):
-            raise ValueError(
-                f"{type(network).__name__} reads {', '.join(keys)}, but task={task.task} observes "
-                f"{', '.join(task.observed)}: set encoder=mlp, or an algorithm with one (rsac, sac, ...)."
-            )
-        self.observed += [key for key in keys if key not in self.observed]
-        return keys
-
-    def policy_encoder(self) -> Any:
-        """Features of what is observed."""
-        node = self.parts.encoder.policy
-        return hydra.utils.instantiate(node, **offered(node, self.parts.task))
-
     @property
-    def width(self) -> int:
-        """The size of these features."""
-        return self.parts.encoder.policy.width
-
-    def actor(self, initial_std: float) -> TensorDictModuleBase:
-        """The policy."""
-        encoder, action_dim = self.policy_encoder(), self.parts.task.network["action_dim"]
-        keys = self.reads(encoder)
-        actor = tanh_gaussian_actor(encoder, self.width, action_dim, keys, scale_init=initial_std)
-        return actor.to(self.parts.device)
-
-    def action_values(
-        self,
-        critics: DictConfig,
-        out_key: str,
-        prepare: Callable[[Any], Any] = lambda network: network,
-    ) -> Any:
-        """As many values of an action as a group of critics has members: one, or a list.
-
-        Args:
-            critics: the group.
-            out_key: where each writes.
-            prepare: what is done with each first.
-        """
-        node = self.parts.encoder.value
-        # Only what differs, so that an encoder need not know of options that it is not asked for.
-        options = {k: v for k, v in critic_options(critics).items() if v != USUAL[k]}
-        networks = [
-            hydra.utils.instantiate(node, **offered(node, self.parts.task), **options).to(
-                self.parts.device
-            )
-            for _ in range(critics.members)
-        ]
-        members = [
-            value_operator(
-                prepare(network), in_keys=(*self.reads(network), "action"), out_key=out_key
-            )
-            for network in networks
-        ]
-        # Of a list of one TorchRL makes parameters that no optimizer sees.
-        return members[0] if len(members) == 1 else members
-
-    def risk_critics(self) -> Any:
-        """Q_c(s, a), at 0, or a projector would correct every action before the first cost was seen."""
-        return self.action_values(self.parts.cost_critic, "state_action_cost_value", zero_output)
-
-
-def critic_options(critics: DictConfig) -> dict[str, Any]:
-    """The options of a group of critics."""
-    given = {key: critics.get(key) for key in USUAL}
-    return {key: USUAL[key] if value is None else value for key, value in given.items()}
+    def stored(self) -> tuple[Any, ...]:
+        """Keys of a transition that are kept: what the networks read of a state and of the next, and :data:`STORED`."""
+        return (*self.observed, *(("next", key) for key in self.observed), *STORED)
 
 
 class Algorithm(ABC):
@@ -226,8 +63,6 @@ class Algorithm(ABC):
 
     values: ClassVar[str]
     risks: ClassVar[str]
-    batch_size: int
-    reward_scale: float
     initial_std: float
     lr: Any
 
@@ -321,7 +156,7 @@ class Algorithm(ABC):
             raise ValueError("risk=mean_std is of several members: set cost_critic=ensemble.")
 
     def agent(self, parts: Parts) -> Agent:
-        """NetworkBuilder, loss and projector.
+        """Networks, loss and projector.
 
         Raises:
             ValueError: parts that do not go together.
@@ -379,8 +214,3 @@ class Algorithm(ABC):
                 own = {"members": critic.members, **critic_options(critic)}
                 options |= {f"{name}.{key}": value for key, value in own.items()}
         return options
-
-
-def keys_of(agent: Agent) -> Sequence[Any]:
-    """What is stored of an observation and the next."""
-    return (*agent.observed, *(("next", key) for key in agent.observed))

@@ -16,7 +16,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import AdditiveGaussianModule
 from torchrl.objectives import LossModule, SoftUpdate
 
-from saferl.algorithms.base import STORED, Agent, Algorithm, NetworkBuilder, keys_of
+from saferl.algorithms.base import Agent, Algorithm
+from saferl.algorithms.networks import NetworkBuilder
 from saferl.config.schema import OffPolicyLearning
 from saferl.envs.task import Task
 from saferl.envs.transforms import ExecutedAction
@@ -97,7 +98,7 @@ class OffPolicy(OffPolicyLearning, Algorithm):
             buffer.append_transform(ExecutedAction())
         return Replay(
             buffer,
-            stored=(*keys_of(agent), *STORED),
+            stored=agent.stored,
             updates_per_frame=self.updates_per_frame,
             warmup_frames=self.warmup_frames,
             demonstrate=partial(self.demonstrate, task, build_env, num_envs, seed)

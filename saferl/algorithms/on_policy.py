@@ -13,16 +13,9 @@ from torchrl.data import LazyTensorStorage, SamplerWithoutReplacement, TensorDic
 from torchrl.envs import EnvBase, InitTracker, Transform
 from torchrl.objectives import LossModule, ValueEstimators
 
-from saferl.algorithms.base import (
-    STORED,
-    USUAL,
-    Agent,
-    Algorithm,
-    NetworkBuilder,
-    Parts,
-    critic_options,
-    keys_of,
-)
+from saferl.algorithms.base import Agent, Algorithm
+from saferl.algorithms.networks import USUAL, NetworkBuilder, critic_options
+from saferl.algorithms.parts import Parts
 from saferl.config.schema import OnPolicyLearning
 from saferl.envs.task import Task
 from saferl.modules import StateValue, value_operator
@@ -118,7 +111,7 @@ class OnPolicy(OnPolicyLearning, Algorithm):
         )
         return Epochs(
             buffer,
-            stored=(*keys_of(agent), *STORED, *ADVANTAGES),
+            stored=(*agent.stored, *ADVANTAGES),
             begin=learner.begin,
             epochs=self.epochs,
             reward_scale=self.reward_scale,

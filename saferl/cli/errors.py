@@ -97,9 +97,8 @@ def _composed(config: str, arguments: list[str], mistaken: str) -> DictConfig:
     """The configuration of a command line, but for its mistakes, of which ``mistaken`` is one."""
     given = [a for a in arguments if "=" in a and not a.startswith("-")]
     given = [a for a in given if a.lstrip("+~").partition("=")[0] != mistaken]
-    given.sort(
-        key=lambda a: "." in a.partition("=")[0]
-    )  # choices first, as settings follow from them
+    # Choices first, as settings follow from them.
+    given.sort(key=lambda argument: "." in argument.partition("=")[0])
     with hydra.initialize_config_dir(config_dir(), version_base="1.3"), suppress(HydraException):
         return hydra.compose(config, given)
     composed, rest = OmegaConf.create(), []

@@ -18,7 +18,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.transforms import Transform
 
 from saferl.algorithms.assemble import build_env, load_agent
-from saferl.algorithms.base import device_of, offered
+from saferl.algorithms.parts import device_of, offered
 from saferl.checkpoint.run import progress, run_config
 from saferl.config.check import check_targets
 from saferl.config.locate import pretrained_run

@@ -24,13 +24,6 @@ OmegaConf.register_new_resolver(
 OmegaConf.register_new_resolver(
     "unless", lambda given, value: value if given is None else None, replace=True
 )
-# ${ceil_div:a,b} is a / b, rounded up; a where the two are not whole, as the check of a and b will say.
-OmegaConf.register_new_resolver(
-    "ceil_div",
-    lambda a, b: -(-a // b) if isinstance(a, int) and isinstance(b, int) and b else a,
-    replace=True,
-)
-
 # ${decisions:${task}}: how many an episode has at most.
 OmegaConf.register_new_resolver(
     "decisions",

@@ -1,0 +1,101 @@
+"""The networks of an agent: policy, state values and action values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import hydra
+from omegaconf import DictConfig
+from tensordict.nn import TensorDictModuleBase
+
+from saferl.algorithms.parts import Parts, offered
+from saferl.modules import tanh_gaussian_actor, value_operator, zero_output
+
+#: Options of a critic of action values, and what they are where nothing is said.
+USUAL = {"outputs": 1, "layer_norm": False}
+
+
+class NetworkBuilder:
+    """Makes the networks of one agent, and remembers what they read.
+
+    Args:
+        parts: of the agent.
+    """
+
+    def __init__(self, parts: Parts):
+        self.parts = parts
+        self.observed: list[str] = []
+
+    def reads(self, network: Any) -> tuple[str, ...]:
+        """The keys that a network reads.
+
+        Raises:
+            ValueError: the task does not offer them.
+        """
+        keys, task = tuple(network.in_keys), self.parts.task
+        if not set(keys) <= set(task.observed):
+            raise ValueError(
+                f"{type(network).__name__} reads {', '.join(keys)}, but task={task.task} observes "
+                f"{', '.join(task.observed)}: set encoder=mlp, or an algorithm with one (rsac, sac, ...)."
+            )
+        self.observed += [key for key in keys if key not in self.observed]
+        return keys
+
+    def policy_encoder(self) -> Any:
+        """Features of what is observed."""
+        node = self.parts.encoder.policy
+        return hydra.utils.instantiate(node, **offered(node, self.parts.task))
+
+    @property
+    def width(self) -> int:
+        """The size of these features."""
+        return self.parts.encoder.policy.width
+
+    def actor(self, initial_std: float) -> TensorDictModuleBase:
+        """The policy."""
+        encoder, action_dim = self.policy_encoder(), self.parts.task.network["action_dim"]
+        keys = self.reads(encoder)
+        actor = tanh_gaussian_actor(encoder, self.width, action_dim, keys, scale_init=initial_std)
+        return actor.to(self.parts.device)
+
+    def action_values(
+        self,
+        critics: DictConfig,
+        out_key: str,
+        prepare: Callable[[Any], Any] = lambda network: network,
+    ) -> Any:
+        """As many values of an action as a group of critics has members: one, or a list.
+
+        Args:
+            critics: the group.
+            out_key: where each writes.
+            prepare: what is done with each first.
+        """
+        node = self.parts.encoder.value
+        # Only what differs, so that an encoder need not know of options that it is not asked for.
+        options = {k: v for k, v in critic_options(critics).items() if v != USUAL[k]}
+        networks = [
+            hydra.utils.instantiate(node, **offered(node, self.parts.task), **options).to(
+                self.parts.device
+            )
+            for _ in range(critics.members)
+        ]
+        members = [
+            value_operator(
+                prepare(network), in_keys=(*self.reads(network), "action"), out_key=out_key
+            )
+            for network in networks
+        ]
+        # Of a list of one TorchRL makes parameters that no optimizer sees.
+        return members[0] if len(members) == 1 else members
+
+    def risk_critics(self) -> Any:
+        """Q_c(s, a), at 0, or a projector would correct every action before the first cost was seen."""
+        return self.action_values(self.parts.cost_critic, "state_action_cost_value", zero_output)
+
+
+def critic_options(critics: DictConfig) -> dict[str, Any]:
+    """The options of a group of critics."""
+    given = {key: critics.get(key) for key in USUAL}
+    return {key: USUAL[key] if value is None else value for key, value in given.items()}

@@ -1,0 +1,95 @@
+"""What an algorithm is composed of, and how a node of a configuration becomes an object."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import hydra
+import torch
+from omegaconf import DictConfig
+
+from saferl.config.check import arguments
+from saferl.envs.task import Task
+
+
+def device_of(name: str) -> torch.device:
+    """A device by its name; ``auto`` is a GPU where there is one.
+
+    Raises:
+        ValueError: CUDA without a GPU.
+    """
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ValueError("device=cuda, but torch sees no GPU; use device=cpu or auto.")
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    return torch.device(name)
+
+
+def make(node: DictConfig, settings: Mapping[str, Any] | None = None, **objects: Any) -> Any:
+    """Instantiate a node with live objects, which Hydra itself would turn into configurations.
+
+    Args:
+        node: with a ``_target_``.
+        settings: in place of the node's own.
+        **objects: arguments that the node may not set.
+
+    Raises:
+        ValueError: the node sets what the composition gives.
+    """
+    for key in set(node) & set(objects):
+        raise ValueError(
+            f"{node._get_full_key(key)} cannot be set: it follows from the rest of the configuration."
+        )
+    return hydra.utils.instantiate(node, _partial_=True, **(settings or {}))(**objects)
+
+
+def offered(node: DictConfig, task: Task) -> dict[str, Any]:
+    """What a task offers to a network and its configuration leaves open, as far as the network takes it."""
+    accepted = arguments(node._target_)
+    return {
+        key: value
+        for key, value in task.network.items()
+        if key not in node and (accepted is None or key in accepted)
+    }
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What an algorithm is composed of: the nodes of a configuration, and the task.
+
+    Attributes:
+        task: what is learned.
+        encoder, critic, cost_critic, risk, loss, lagrange, projector: nodes of these groups.
+        gamma: discount.
+        device: of everything.
+    """
+
+    task: Task
+    encoder: DictConfig
+    critic: DictConfig
+    cost_critic: DictConfig
+    risk: DictConfig
+    loss: DictConfig
+    lagrange: DictConfig
+    projector: DictConfig
+    gamma: float
+    device: torch.device
+
+    @classmethod
+    def of(cls, cfg: DictConfig) -> Parts:
+        """The parts of a run's configuration."""
+        groups = ("encoder", "critic", "cost_critic", "risk", "loss", "lagrange", "projector")
+        return cls(
+            task=hydra.utils.instantiate(cfg.task),
+            gamma=cfg.gamma,
+            device=device_of(cfg.device),
+            **{group: cfg[group] for group in groups},
+        )
+
+    @property
+    def takes(self) -> set[str]:
+        """Names of what the loss is built from."""
+        return set(inspect.signature(hydra.utils.get_object(self.loss._target_)).parameters)
