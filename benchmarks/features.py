@@ -39,7 +39,7 @@ def without(kind: str, names: tuple[str, ...]) -> list[str]:
     scales = getattr(FORMS["route"], kind).items()
     row = [BLANK if name in names else scale for name, scale in scales]
     setting = f"{kind}_scale={row}".replace(" ", "")
-    return [f"+encoder.{network}.{setting}" for network in ("policy", "value")]
+    return [f"+encoder.{setting}"]
 
 
 def main() -> None:

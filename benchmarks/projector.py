@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
+from plain import PlainMMAMValue
 from side_by_side import alternate, conditions, medians, parser, write
 from tensordict import TensorDict
 from torch import Tensor
@@ -26,7 +27,7 @@ from torchrl.envs import Transform, TransformedEnv
 
 from saferl.envs.intersection import BatchedIntersection, Scenario
 from saferl.envs.transforms import SafetyProjector
-from saferl.modules import CriticEnsemble, MMAMValue, PlainMMAMValue, value_operator
+from saferl.modules import CriticEnsemble, MMAMValue, value_operator
 
 
 def scenes(batch: int, device: str) -> TensorDict:

@@ -29,7 +29,7 @@ def serve(algo: str, threads: int, width: int, compile: bool, seconds: float) ->
 
     torch.set_num_threads(threads)
     data = transitions(256, "cpu")
-    update = learner([f"algo={algo}", f"encoder.policy.width={width}"], "cpu", compile).update
+    update = learner([f"algo={algo}", f"encoder.width={width}"], "cpu", compile).update
     for _ in range(3):
         update(data)
     print("ready", flush=True)

@@ -1,6 +1,6 @@
 """Updates a second of this checkout and of another, in turn.
 
-    python benchmarks/two_checkouts.py OTHER [--runs "algo=arsac encoder.policy.width=64" "algo=sac"]
+    python benchmarks/two_checkouts.py OTHER [--runs "algo=arsac encoder.width=64" "algo=sac"]
         [--modes eager compiled] [--batch 256] [--rounds 5] [--seconds 3] [--threads 1] [--json PATH]
 
 OTHER is a folder with another commit of saferl (``git worktree add ../before COMMIT``), which runs on the same
@@ -49,6 +49,9 @@ def serve(overrides: list[str], options: Any) -> None:
     device, compiled = options.device, options.modes == ["compiled"]
     overrides = [*overrides, f"device={device}", f"compile={compiled}"]
     with initialize_config_dir(config_dir(), version_base=None):
+        cfg = compose("config", overrides[-2:])
+        if "policy" in cfg.encoder:  # older commits have settings for each network
+            overrides = [o.replace("encoder.", "encoder.policy.") for o in overrides]
         cfg = compose("config", overrides)
         if "observation" in cfg.task:  # older commits have no other than the world's
             cfg = compose("config", [*overrides, "task.observation=world"])
@@ -102,7 +105,7 @@ def main() -> None:
     arguments.add_argument(
         "--runs",
         nargs="+",
-        default=["algo=arsac encoder.policy.width=64", "algo=sac encoder.policy.width=128"],
+        default=["algo=arsac encoder.width=64", "algo=sac encoder.width=128"],
     )
     arguments.add_argument("--modes", nargs="+", default=["eager", "compiled"])
     arguments.add_argument("--batch", type=int, default=256)

@@ -40,10 +40,7 @@ from saferl.config.locate import config_dir
 from saferl.training.learner import Learner
 
 ROWS = 11
-PLAIN = [
-    "encoder.policy._target_=saferl.modules.PlainMMAMPolicyEncoder",
-    "encoder.value._target_=saferl.modules.PlainMMAMValue",
-]
+PLAIN = ["encoder._target_=plain.PlainMMAM"]
 
 
 class Flops(TorchDispatchMode):
@@ -141,7 +138,7 @@ def main() -> None:
         sides[name] = work
 
     def ours(name: str, overrides: list[str]) -> None:
-        overrides = [*overrides, f"encoder.policy.width={width}"]
+        overrides = [*overrides, f"encoder.width={width}"]
         add(f"{name} eager", learner(overrides, device, False).update, data)
         compiled = learner(overrides, device, True).update
         add(f"{name} compiled", compiled, data, f"{name} eager")

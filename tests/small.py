@@ -25,7 +25,7 @@ SMALL = (
     *ON_POLICY,
     "learning.batch_size=8",
     "record_every=8",
-    "encoder.policy.width=16",
+    "encoder.width=16",
     "evaluation.episodes=1",
     "logger=none",
     "device=cpu",

@@ -11,7 +11,7 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
 FAST = [
-    "encoder.policy.width=16",
+    "encoder.width=16",
     "learning.warmup_frames=64",
     "learning.batch_size=16",
     "compile=false",
@@ -51,7 +51,7 @@ def run(tmp_path_factory) -> Path:
         ["training", "--algos", "sac_lag", "--episodes", "20", "--set", *FAST],
         ["traffic", "--episodes", "5"],
         ["oracle", "--episodes", "2"],
-        ["two_checkouts", ".", "--runs", "algo=sac encoder.policy.width=16", "--modes", "eager", "--batch", "8",
+        ["two_checkouts", ".", "--runs", "algo=sac encoder.width=16", "--modes", "eager", "--batch", "8",
          *SHORT],
         ["reward_audit", "--episodes", "4"],
         ["mmam_forms", "--seeds", "0", "--updates", "20", "--width", "16"],

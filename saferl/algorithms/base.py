@@ -205,9 +205,7 @@ class Algorithm(ABC):
         # Of the critics those of action values: state values have no options.
         critics = {"critic": "qvalue_network", "cost_critic": self.risks}
         present = [name for name, argument in critics.items() if argument in parts.takes]
-        for network in ("policy", "value") if present else ("policy",):
-            for key, value in parts.encoder[network].items():
-                options[f"encoder.{network}.{key}"] = value
+        options |= {f"encoder.{key}": value for key, value in parts.encoder.items()}
         for name in present:
             critic = getattr(parts, name)
             if critic.members > 0:

@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 
 from saferl.algorithms.parts import Parts, offered
-from saferl.modules import tanh_gaussian_actor, value_operator, zero_output
+from saferl.modules import Encoder, tanh_gaussian_actor, value_operator, zero_output
 
 #: Options of a critic of action values, and what they are where nothing is said.
 USUAL = {"outputs": 1, "layer_norm": False}
@@ -25,6 +25,8 @@ class NetworkBuilder:
 
     def __init__(self, parts: Parts):
         self.parts = parts
+        node = parts.encoder
+        self.encoder: Encoder = hydra.utils.instantiate(node, **offered(node, parts.task))
         self.observed: list[str] = []
 
     def reads(self, network: Any) -> tuple[str, ...]:
@@ -42,21 +44,12 @@ class NetworkBuilder:
         self.observed += [key for key in keys if key not in self.observed]
         return keys
 
-    def policy_encoder(self) -> Any:
-        """Features of what is observed."""
-        node = self.parts.encoder.policy
-        return hydra.utils.instantiate(node, **offered(node, self.parts.task))
-
-    @property
-    def width(self) -> int:
-        """The size of these features."""
-        return self.parts.encoder.policy.width
-
     def actor(self, initial_std: float) -> TensorDictModuleBase:
         """The policy."""
-        encoder, action_dim = self.policy_encoder(), self.parts.task.network["action_dim"]
-        keys = self.reads(encoder)
-        actor = tanh_gaussian_actor(encoder, self.width, action_dim, keys, scale_init=initial_std)
+        features = self.encoder.policy()
+        width, action_dim = self.encoder.width, self.parts.task.network["action_dim"]
+        keys = self.reads(features)
+        actor = tanh_gaussian_actor(features, width, action_dim, keys, scale_init=initial_std)
         return actor.to(self.parts.device)
 
     def action_values(
@@ -72,14 +65,10 @@ class NetworkBuilder:
             out_key: where each writes.
             prepare: what is done with each first.
         """
-        node = self.parts.encoder.value
         # Only what differs, so that an encoder need not know of options that it is not asked for.
         options = {k: v for k, v in critic_options(critics).items() if v != USUAL[k]}
         networks = [
-            hydra.utils.instantiate(node, **offered(node, self.parts.task), **options).to(
-                self.parts.device
-            )
-            for _ in range(critics.members)
+            self.encoder.value(**options).to(self.parts.device) for _ in range(critics.members)
         ]
         members = [
             value_operator(

@@ -59,9 +59,9 @@ class OnPolicy(OnPolicyLearning, Algorithm):
 
     def loss_parts(self, networks: NetworkBuilder) -> dict[str, Callable[[], Any]]:
         def state_value(out_key: str) -> torch.nn.Module:
-            encoder = networks.policy_encoder()
-            network = StateValue(encoder, networks.width).to(networks.parts.device)
-            return value_operator(network, in_keys=networks.reads(encoder), out_key=out_key)
+            features = networks.encoder.policy()
+            network = StateValue(features, networks.encoder.width).to(networks.parts.device)
+            return value_operator(network, in_keys=networks.reads(features), out_key=out_key)
 
         return {
             "critic_network": lambda: state_value("state_value"),

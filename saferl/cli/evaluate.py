@@ -172,7 +172,7 @@ def choose_policy(
     cfg = on_its_own_task(cfg, trained, overrides)
     task, learned = hydra.utils.instantiate(cfg.task), hydra.utils.instantiate(trained.task)
     task.check_policy_of(learned)
-    for key, value in offered(trained.encoder.policy, learned).items():
+    for key, value in offered(trained.encoder, learned).items():
         if task.network[key] != value:
             raise ValueError(
                 f"task.{key} must be {value}, the number that this policy's network was trained with, "

@@ -163,14 +163,6 @@ class _OnPolicyNode(OnPolicyLearning):
 
 
 @dataclass
-class Encoder:
-    """Networks of what is observed: features for a policy or a state value, and action values."""
-
-    policy: dict[str, Any] = field(default_factory=dict)
-    value: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass
 class Lagrange:
     """A multiplier, and what moves it."""
 
@@ -215,7 +207,7 @@ class Training:
     algo_name: str = MISSING
     task: dict[str, Any] = field(default_factory=dict)
     env: dict[str, Any] = field(default_factory=dict)
-    encoder: Encoder = field(default_factory=Encoder)
+    encoder: dict[str, Any] = field(default_factory=dict)
     learning: Any = None
     critic: Critics = MISSING
     cost_critic: Critics = MISSING

@@ -8,22 +8,26 @@ from saferl.modules.critics import (
     value_operator,
     zero_output,
 )
+from saferl.modules.encoder import Encoder
 from saferl.modules.exploration import HeldActions
 from saferl.modules.lagrange import DualAscent, LagrangeMultiplier, PIDMultiplier
-from saferl.modules.mlp import MLPPolicyEncoder, MLPValue
-from saferl.modules.mmam import EGO_SCALE, VEHICLE_SCALE, MMAMPolicyEncoder, MMAMValue
-from saferl.modules.plain import PlainMMAMPolicyEncoder, PlainMMAMValue
+from saferl.modules.mlp import MLP, MLPPolicyEncoder, MLPValue
+from saferl.modules.mmam import MMAM, MMAMPolicyEncoder, MMAMValue
 from saferl.modules.projection import ProjectionResult, project
 from saferl.modules.risk import CVaR, Largest, MeanStd
-from saferl.modules.sets import SetPolicyEncoder, SetValue
+from saferl.modules.scene import EGO_SCALE, VEHICLE_SCALE
+from saferl.modules.sets import MaxPool, SetPolicyEncoder, SetValue
 
 __all__ = [
     "EGO_SCALE",
+    "MLP",
+    "MMAM",
     "VEHICLE_SCALE",
     "BoundCritics",
     "CVaR",
     "CriticEnsemble",
     "DualAscent",
+    "Encoder",
     "GaussianHead",
     "HeldActions",
     "LagrangeMultiplier",
@@ -32,10 +36,9 @@ __all__ = [
     "MLPValue",
     "MMAMPolicyEncoder",
     "MMAMValue",
+    "MaxPool",
     "MeanStd",
     "PIDMultiplier",
-    "PlainMMAMPolicyEncoder",
-    "PlainMMAMValue",
     "ProjectionResult",
     "SetPolicyEncoder",
     "SetValue",

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from saferl.modules.mmam import (
+from saferl.modules.encoder import Encoder
+from saferl.modules.scene import (
     EGO_SCALE,
     VEHICLE_SCALE,
     check_sizes,
@@ -224,3 +226,38 @@ class MLPValue(nn.Module):
     def forward(self, *inputs: Tensor) -> Tensor:
         *observed, action = inputs
         return self.value(self.encode(*observed), action)
+
+
+@dataclass(frozen=True)
+class MLP(Encoder):
+    """Plain layers for all networks of an algorithm.
+
+    Args:
+        width, depth, activation: of the hidden layers.
+        rows: M, the number of vehicle rows.
+        size: of a plain ``observation``, in place of a scene.
+        action_dim: size of the action.
+        ego_scale: divisors of the ego features.
+        vehicle_scale: divisors of a vehicle's features; I_veh comes first.
+
+    Examples:
+        >>> from saferl.modules import MLP
+        >>> encoder = MLP(width=32, size=4)
+        >>> encoder.policy().in_keys, type(encoder.value()).__name__
+        (('observation',), 'MLPValue')
+    """
+
+    width: int = 256
+    depth: int = 3
+    activation: type[nn.Module] = nn.GELU
+    rows: int | None = 11
+    size: int | None = None
+    action_dim: int = 2
+    ego_scale: Sequence[float] = EGO_SCALE
+    vehicle_scale: Sequence[float] = VEHICLE_SCALE
+
+    def policy(self) -> MLPPolicyEncoder:
+        return MLPPolicyEncoder(**self.settings("action_dim"))
+
+    def value(self, **options: Any) -> MLPValue:
+        return MLPValue(**self.settings(), **options)

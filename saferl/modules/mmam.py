@@ -4,72 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-EGO_SCALE = (1.0, 10.0, 10.0, 10.0, 2.0, 1.0, 1.0, 20.0, 50.0)
-"""Divisors of the ego features (I_veh, x, y, v_x, v_y, phi, omega, d_veh, d_des)."""
-VEHICLE_SCALE = (1.0, 20.0, 20.0, 10.0, 10.0, 1.0)
-"""Divisors of a vehicle's features (I_veh, dx, dy, dv_x, dv_y, phi)."""
-
-#: In place of what belongs to an absent row, before a softmax or a largest.
-_MASKED = -1e9
-
-
-def feature_scale(name: str, values: Sequence[float]) -> Tensor:
-    """The divisors of a row of features as a tensor; every one must be positive and finite."""
-    scale = torch.as_tensor(values, dtype=torch.get_default_dtype())
-    if scale.ndim != 1 or not bool((scale.isfinite() & (scale > 0)).all()):
-        raise ValueError(f"{name} must be positive finite numbers, got {tuple(values)}.")
-    return scale
-
-
-def check_sizes(**sizes: int) -> None:
-    """Refuses a size or count below 1, by its name."""
-    for name, value in sizes.items():
-        if value < 1:
-            raise ValueError(f"{name} must be >= 1, got {value}.")
-
-
-def scale_ego(ego: Tensor, scale: Tensor) -> Tensor:
-    """Scaled features [*B, F]."""
-    if ego.shape[-1] != len(scale):  # one feature would be repeated
-        raise ValueError(f"ego must have {len(scale)} features, got shape {tuple(ego.shape)}.")
-    return ego / scale
-
-
-def scale_vehicles(vehicles: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
-    """Scaled features [*B, M, F], zero where the row is absent, and presence [*B, M] (bool)."""
-    if vehicles.shape[-1] != len(scale):
-        raise ValueError(
-            f"vehicles must have {len(scale)} features, got shape {tuple(vehicles.shape)}."
-        )
-    present = vehicles[..., 0] > 0
-    return torch.where(present.unsqueeze(-1), vehicles / scale, 0.0), present
-
-
-def largest(rows: Tensor, present: Tensor) -> Tensor:
-    """The largest of the rows [*B, M, K] that are ``present`` [*B, M, 1], [*B, K]; where none is, so low that
-    a GELU makes 0 of it."""
-    if not rows.shape[-2]:
-        return rows.new_full((*rows.shape[:-2], rows.shape[-1]), _MASKED)
-    # A sum, whose gradient is the rows' own: choosing row by row took a sixth of an update at width 64.
-    return (rows + torch.where(present, 0.0, _MASKED)).amax(-2)
-
-
-def flat_linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """``F.linear`` of [*B, F] as of [N, F].
-
-    With stacked weights, vmap turns a linear map of three or more dimensions into a product with
-    one copy of the weights for each scene, which is several times slower.
-    """
-    if x.ndim == 2:
-        return F.linear(x, weight, bias)
-    out = F.linear(x.reshape(-1, x.shape[-1]), weight, bias)
-    return out.reshape(*x.shape[:-1], out.shape[-1])
+from saferl.modules.encoder import Encoder
+from saferl.modules.scene import (
+    EGO_SCALE,
+    MASKED,
+    VEHICLE_SCALE,
+    check_sizes,
+    feature_scale,
+    flat_linear,
+    largest,
+    scale_ego,
+    scale_vehicles,
+)
 
 
 class _Linear(nn.Linear):
@@ -126,7 +79,7 @@ class _SelfAttention(_Attention):
         query, key, value = split.unbind(-3)
         # Keys first: a softmax over a long way through memory is several times faster than over 12 neighbours.
         logits = torch.einsum("...qhd,...khd->...kqh", query / self.divisor, key)
-        weights = logits.masked_fill(~present[..., None, None], _MASKED).softmax(-3)
+        weights = logits.masked_fill(~present[..., None, None], MASKED).softmax(-3)
         return self.merge(torch.einsum("...kqh,...khd->...qhd", weights, value).flatten(-2))
 
 
@@ -157,7 +110,7 @@ class _EgoAttention(_Attention):
 
     def forward(self, row: Tensor, tokens: Tensor, present: Tensor) -> Tensor:
         logits = self.folded_query(row) @ tokens.mT
-        weights = logits.masked_fill(~present.unsqueeze(-2), _MASKED).softmax(-1)
+        weights = logits.masked_fill(~present.unsqueeze(-2), MASKED).softmax(-1)
         weight = self.value.weight.unflatten(0, (self.heads, -1))
         heads = torch.einsum("...hd,hkd->...hk", weights @ tokens, weight)
         return self.merge(heads.flatten(-2))
@@ -326,7 +279,7 @@ class MMAMValue(nn.Module):
         width = ego_token.shape[-1]
         query = self.attention.folded_query(ego_token)
         readout = self.attention.folded_value(self.w_attn.weight.squeeze(0))
-        logits = (query @ tokens.mT).masked_fill(~present.unsqueeze(-2), _MASKED)
+        logits = (query @ tokens.mT).masked_fill(~present.unsqueeze(-2), MASKED)
         # A layer on concatenated tokens is a sum of one product for each of them.
         on_vehicle, on_ego, pair_on_action = self.pair.weight.split(width, dim=-1)
         pair = flat_linear(vehicle_tokens, on_vehicle, self.pair.bias)
@@ -359,3 +312,36 @@ class MMAMValue(nn.Module):
 
     def forward(self, ego: Tensor, vehicles: Tensor, action: Tensor) -> Tensor:
         return self.value(self.encode(ego, vehicles), action)
+
+
+@dataclass(frozen=True)
+class MMAM(Encoder):
+    """The paper's attention for all networks of an algorithm.
+
+    Args:
+        width, heads, scale, keys, depth: see :class:`MMAMPolicyEncoder` and :class:`MMAMValue`, which has no ``keys``.
+        action_dim: size of the action.
+        ego_scale: divisors of the ego features.
+        vehicle_scale: divisors of a vehicle's features; I_veh comes first.
+
+    Examples:
+        >>> from saferl.modules import MMAM
+        >>> encoder = MMAM(width=32)
+        >>> type(encoder.policy()).__name__, type(encoder.value(outputs=8)).__name__
+        ('MMAMPolicyEncoder', 'MMAMValue')
+    """
+
+    width: int = 256
+    heads: int = 4
+    scale: str = "paper"
+    keys: str = "attended"
+    depth: int = 2
+    action_dim: int = 2
+    ego_scale: Sequence[float] = EGO_SCALE
+    vehicle_scale: Sequence[float] = VEHICLE_SCALE
+
+    def policy(self) -> MMAMPolicyEncoder:
+        return MMAMPolicyEncoder(**self.settings("action_dim"))
+
+    def value(self, **options: Any) -> MMAMValue:
+        return MMAMValue(**self.settings("keys"), **options)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from saferl.modules.encoder import Encoder
 from saferl.modules.mlp import MLPPolicyEncoder, MLPValue
-from saferl.modules.mmam import (
+from saferl.modules.scene import (
     EGO_SCALE,
     VEHICLE_SCALE,
     check_sizes,
@@ -134,3 +137,34 @@ class SetValue(MLPValue):
         scene = _PooledScene(vehicle_width, ego_scale, vehicle_scale)
         keys = ("ego", "vehicles")
         self._build(scene, keys, width, depth, action_dim, activation, outputs, layer_norm)
+
+
+@dataclass(frozen=True)
+class MaxPool(Encoder):
+    """A layer on each vehicle and their largest values, for all networks of an algorithm.
+
+    Args:
+        width, depth, vehicle_width, activation: see :class:`SetPolicyEncoder`.
+        action_dim: size of the action.
+        ego_scale: divisors of the ego features.
+        vehicle_scale: divisors of a vehicle's features; its presence comes first.
+
+    Examples:
+        >>> from saferl.modules import MaxPool
+        >>> type(MaxPool(width=32).policy()).__name__
+        'SetPolicyEncoder'
+    """
+
+    width: int = 128
+    depth: int = 2
+    vehicle_width: int | None = None
+    activation: type[nn.Module] = nn.GELU
+    action_dim: int = 2
+    ego_scale: Sequence[float] = EGO_SCALE
+    vehicle_scale: Sequence[float] = VEHICLE_SCALE
+
+    def policy(self) -> SetPolicyEncoder:
+        return SetPolicyEncoder(**self.settings("action_dim"))
+
+    def value(self, **options: Any) -> SetValue:
+        return SetValue(**self.settings(), **options)

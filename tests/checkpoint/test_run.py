@@ -145,7 +145,7 @@ def test_files_return_to_what_they_were(tmp_path: Path):
 
 
 def test_another_architecture_names_the_parameter_and_the_way_out(run: Path):
-    wide = compose(*SMALL, *EMPTY, "algo=rsac", "encoder.policy.width=24")
+    wide = compose(*SMALL, *EMPTY, "algo=rsac", "encoder.width=24")
     with pytest.raises(ValueError) as refused:
         load_agent(wide, run, "checkpoint")
     message = str(refused.value)

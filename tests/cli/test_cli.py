@@ -79,7 +79,7 @@ MISTAKES = [
     (TRAIN, "task.reward.reading=foo", "reading must be one of normalised, raw, got 'foo'"),
     (TRAIN, "task.vehicles=abc", "task.vehicles must be a whole number or null, got 'abc'"),
     (TRAIN, "env.num_envs=abc", "env.num_envs must be a whole number, got 'abc'"),
-    (TRAIN, "encoder.policy.heads=3", "width must be a multiple of heads, got 32 and 3"),
+    (TRAIN, "encoder.heads=3", "width must be a multiple of heads, got 32 and 3"),
     (TRAIN, "lagrange.multiplier.lr=-1", "lr must be finite and > 0, got -1"),
     (TRAIN, "loss=sac", "takes no cost_critic: set cost_critic=none, or another loss"),
     (TRAIN, "algo=sac loss=sac_lag", "needs cost_critic, got cost_critic=none"),
@@ -167,7 +167,7 @@ def test_missing_logger_is_named(refusal, monkeypatch):
 
     real = hydra.utils.instantiate
     monkeypatch.setattr(hydra.utils, "instantiate", instantiate)
-    line = refusal(*TRAIN, "logger=wandb", "encoder.policy.width=16")
+    line = refusal(*TRAIN, "logger=wandb", "encoder.width=16")
     assert "WandbLogger needs a package that is not installed" in line and "pip install" in line
 
 
@@ -185,8 +185,8 @@ def test_a_run_is_not_written_over_nor_reconfigured(run: Path, refusal):
     assert "holds a run already; continue it with resume=" in refusal(*TRAIN, f"out={run}")
     line = refusal(*TRAIN, f"resume={run}", "gamma=0.9", "out=x")
     assert "takes no other option, got gamma=0.9, out=x" in line
-    line = refusal(*TRAIN, *SMALL, *EMPTY, f"init={run}", "algo=sac", "encoder.policy.width=24")
-    assert "task.rows is 2 there and 11 here, encoder.policy.width is 16 there and 24 here" in line
+    line = refusal(*TRAIN, *SMALL, *EMPTY, f"init={run}", "algo=sac", "encoder.width=24")
+    assert "task.rows is 2 there and 11 here, encoder.width is 16 there and 24 here" in line
     assert "task.rows must be 2" in refusal(*TEST, f"checkpoint={run}", "task.rows=3")
 
 
@@ -232,7 +232,7 @@ def test_init_among_on_policy_algorithms(tmp_path: Path, refusal):
         assert not isinstance(ours[key], torch.Tensor) or torch.equal(ours[key], theirs[key]), key
     for algo in ("cpo", "sac"):
         line = refusal(*TRAIN, *SMALL, f"algo={algo}", "task=cart", f"init={first}")
-        assert "do not fit: encoder.policy." in line and "torch.nn.Tanh" in line
+        assert "do not fit: encoder." in line and "torch.nn.Tanh" in line
 
 
 def test_a_test_does_not_change_a_task_that_is_not_the_roads(tmp_path: Path, refusal):
@@ -271,7 +271,7 @@ def test_init_of_another_algorithm(run: Path, tmp_path: Path, refusal):
 
     line = refusal(*TRAIN, *SMALL, *EMPTY, f"init={run}", "algo=asac", "task.rows=3")
     assert "task.rows is 2 there and 3 here" in line
-    assert "encoder.policy._target_ is saferl.modules.MLPPolicyEncoder there and" in line
+    assert "encoder._target_ is saferl.modules.MLP there and" in line
 
 
 def test_train_from_any_folder_then_multirun(command, tmp_path: Path, capsys):

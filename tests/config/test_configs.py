@@ -174,7 +174,7 @@ def test_algorithm_builds_and_makes_updates(algo: str, task: str, tmp_path: Path
             with pytest.raises(ValueError, match="set shaping=none"):
                 build_trainer(cfg, tmp_path)
             return
-        if cfg.encoder.policy._target_.endswith(("MMAMPolicyEncoder", "SetPolicyEncoder")):
+        if cfg.encoder._target_.endswith((".MMAM", ".MaxPool")):
             with pytest.raises(
                 ValueError, match="reads ego, vehicles, but task=.* set encoder=mlp"
             ):
@@ -191,7 +191,7 @@ def test_algorithm_builds_and_makes_updates(algo: str, task: str, tmp_path: Path
 @pytest.mark.parametrize("algo", sorted(PARTS))
 def test_composition_is_the_papers(algo: str):
     encoder, cost_critics, signal, projector, shaping = PARTS[algo]
-    cfg = compose(f"algo={algo}", "encoder.policy.width=16")
+    cfg = compose(f"algo={algo}", "encoder.width=16")
     agent = build_agent(cfg)
     assert cfg.algo_name == algo
     assert isinstance(next(m for m in agent.actor.modules() if isinstance(m, encoder)), encoder)
@@ -231,7 +231,7 @@ def test_cost_limit_sets_the_episode_budget_of_sac_lag(options, limit: float):
 @pytest.mark.parametrize("option", [o for o in OPTIONS if o.startswith("experiment=")])
 @pytest.mark.parametrize("algo", ["arsac", "rsac", "sac", "cpo"])
 def test_preset_builds_with_either_kind_of_algorithm(option: str, algo: str, tmp_path: Path):
-    fast = ("encoder.policy.width=16", "logger=none", "compile=false", "threads=1")
+    fast = ("encoder.width=16", "logger=none", "compile=false", "threads=1")
     cfg = compose(option, f"algo={algo}", *fast)
     if option == "experiment=speed":
         pytest.importorskip("mujoco")
@@ -245,7 +245,7 @@ def test_preset_builds_with_either_kind_of_algorithm(option: str, algo: str, tmp
 def test_command_line_beats_preset_beats_algorithm():
     cfg = compose("experiment=quickstart", "algo=sac", "encoder=mmam", "episodes=7")
     assert cfg.episodes == 7
-    assert cfg.encoder.policy._target_.endswith("MMAMPolicyEncoder")
+    assert cfg.encoder._target_.endswith(".MMAM")
     assert cfg.env._target_.endswith("BatchedIntersection")
 
 
@@ -284,13 +284,13 @@ def test_a_setting_that_nothing_would_read_does_not_compose(algo: str, option: s
 def test_a_typo_in_a_preset_is_refused():
     """Hydra lets files add keys; only the check can tell."""
     for key, value, message in (
-        ("encoder.value.depht", 3, r"unknown key encoder.value.depht: .* takes .*width"),
+        ("encoder.depht", 3, r"unknown key encoder.depht: .* takes .*width"),
         ("task.vehicels", 3, "unknown key task.vehicels: .*Scenario takes task, vehicles"),
         ("loss.cost_limits", 3, "unknown key loss.cost_limits"),
         ("projector.step_size", "0.02 rad", "projector.step_size must be a number, got '0.02 rad'"),
         ("task.reward.weights", [1, "x"], "task.reward.weights must be a list, each a number"),
         ("task.standstill", "never", "task.standstill must be a number or null, got 'never'"),
-        ("encoder.policy._target_", "saferl.Nothing", "'saferl.Nothing'"),
+        ("encoder._target_", "saferl.Nothing", "'saferl.Nothing'"),
     ):
         cfg = compose()
         OmegaConf.set_struct(cfg, False)

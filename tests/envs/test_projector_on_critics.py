@@ -7,6 +7,7 @@ import functools
 import pytest
 import torch
 from echo import EchoEnv
+from plain import PlainMMAMValue
 from tensordict import TensorDict
 from torchrl.data import Unbounded
 from torchrl.envs import Transform, TransformedEnv
@@ -17,7 +18,6 @@ from saferl.modules import (
     CriticEnsemble,
     MLPValue,
     MMAMValue,
-    PlainMMAMValue,
     project,
     projection,
     value_operator,

@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
+from plain import PlainMMAMPolicyEncoder, PlainMMAMValue
 from tensordict import TensorDict
 
 from saferl.modules import (
@@ -14,8 +15,6 @@ from saferl.modules import (
     VEHICLE_SCALE,
     MMAMPolicyEncoder,
     MMAMValue,
-    PlainMMAMPolicyEncoder,
-    PlainMMAMValue,
 )
 
 WIDTH, HEADS = 16, 4

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from plain import PlainMMAMValue
 from tensordict import TensorDict
 
 from saferl.modules import (
@@ -14,7 +15,6 @@ from saferl.modules import (
     MeanStd,
     MLPValue,
     MMAMValue,
-    PlainMMAMValue,
     value_operator,
     zero_output,
 )

@@ -12,10 +12,7 @@ from torchrl.objectives import SoftUpdate
 from saferl.algorithms.assemble import algorithm_of, build_agent
 from saferl.training.learner import Learner
 
-PLAIN = (
-    "encoder.policy._target_=saferl.modules.PlainMMAMPolicyEncoder",
-    "encoder.value._target_=saferl.modules.PlainMMAMValue",
-)
+PLAIN = ("encoder._target_=plain.PlainMMAM",)
 LOSSES = ("loss_actor", "loss_qvalue", "loss_cost", "loss_alpha")
 
 
@@ -29,7 +26,7 @@ def double():
 
 def learner(*overrides: str, algo: str = "arsac", compile: bool = False) -> Learner:
     """With width 16 in float64, always with the same first weights."""
-    cfg = compose(f"algo={algo}", "encoder.policy.width=16", "device=cpu", *overrides)
+    cfg = compose(f"algo={algo}", "encoder.width=16", "device=cpu", *overrides)
     torch.manual_seed(0)
     loss = build_agent(cfg).loss.double()
     with torch.no_grad():  # cost critics begin at zero, which would hide what they do
@@ -76,7 +73,7 @@ def losses_and_gradients(learner: Learner) -> tuple[torch.Tensor, dict[str, torc
 
 FORMS = [
     pytest.param({}, (), id="keys by default"),
-    pytest.param({}, ("encoder.policy.keys=attended",), id="others"),
+    pytest.param({}, ("encoder.keys=attended",), id="others"),
     pytest.param({"compile": True}, (), id="compiled", marks=pytest.mark.slow),
 ]
 

@@ -7,17 +7,14 @@ what the algebra of ``mmam.py`` saves (``benchmarks/update.py``).
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from saferl.modules.mmam import (
-    _MASKED,
-    MMAMPolicyEncoder,
-    MMAMValue,
-    _EgoAttention,
-    largest,
-)
+from saferl.modules.mmam import MMAM, MMAMPolicyEncoder, MMAMValue, _EgoAttention
+from saferl.modules.scene import MASKED, largest
 
 
 def _attend(
@@ -28,7 +25,7 @@ def _attend(
         x.unflatten(-1, (heads, -1)).transpose(-3, -2) for x in (queries, keys, values)
     )
     logits = query @ key.mT / divisor
-    logits = logits.masked_fill(~present[..., None, None, :], _MASKED)
+    logits = logits.masked_fill(~present[..., None, None, :], MASKED)
     return (logits.softmax(-1) @ value).transpose(-3, -2).flatten(-2)
 
 
@@ -44,7 +41,8 @@ class PlainMMAMPolicyEncoder(MMAMPolicyEncoder):
 
     Examples:
         >>> import torch
-        >>> from saferl.modules import MMAMPolicyEncoder, PlainMMAMPolicyEncoder
+        >>> from plain import PlainMMAMPolicyEncoder
+        >>> from saferl.modules import MMAMPolicyEncoder
         >>> encoder, plain = MMAMPolicyEncoder(width=32), PlainMMAMPolicyEncoder(width=32)
         >>> _ = plain.load_state_dict(encoder.state_dict())
         >>> scene = torch.randn(5, 9), torch.ones(5, 3, 6)
@@ -74,7 +72,8 @@ class PlainMMAMValue(MMAMValue):
 
     Examples:
         >>> import torch
-        >>> from saferl.modules import MMAMValue, PlainMMAMValue
+        >>> from plain import PlainMMAMValue
+        >>> from saferl.modules import MMAMValue
         >>> value, plain = MMAMValue(width=32), PlainMMAMValue(width=32)
         >>> _ = plain.load_state_dict(value.state_dict())
         >>> scene = torch.randn(5, 9), torch.ones(5, 3, 6), torch.zeros(5, 2)
@@ -101,3 +100,13 @@ class PlainMMAMValue(MMAMValue):
         for layer in self.layers:
             y_mlp = self._activate(layer(y_mlp))
         return self.w_attn(y_attn) + self.w_mlp(y_mlp)
+
+
+class PlainMMAM(MMAM):
+    """MMAM with the networks as printed (``encoder._target_=plain.PlainMMAM``)."""
+
+    def policy(self) -> PlainMMAMPolicyEncoder:
+        return PlainMMAMPolicyEncoder(**self.settings("action_dim"))
+
+    def value(self, **options: Any) -> PlainMMAMValue:
+        return PlainMMAMValue(**self.settings("keys"), **options)
