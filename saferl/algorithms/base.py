@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, Transform
 from torchrl.objectives import LossModule
 
-from saferl.algorithms.networks import NetworkBuilder, critic_options
+from saferl.algorithms.networks import NetworkBuilder, critic_options, refuse_options
 from saferl.algorithms.parts import Parts, make
 from saferl.envs.task import Task
 from saferl.envs.transforms import SafetyProjector
@@ -138,6 +138,8 @@ class Algorithm(ABC):
                 raise ValueError(f"{loss} takes no {name}: set {name}=none, or another loss.")
             if name in takes and not present:
                 raise ValueError(f"{loss} needs {name}, got {name}=none.")
+        if not groups["cost_critic"]:
+            refuse_options("cost_critic", parts.cost_critic, loss)
         if parts.projector._target_ is not None and self.risks not in takes:
             raise ValueError(
                 f"projector needs cost critics Q_c(s, a), which {loss} has not: "

@@ -88,3 +88,16 @@ def critic_options(critics: DictConfig) -> dict[str, Any]:
     """The options of a group of critics."""
     given = {key: critics.get(key) for key in USUAL}
     return {key: USUAL[key] if value is None else value for key, value in given.items()}
+
+
+def refuse_options(name: str, critics: DictConfig, loss: str) -> None:
+    """Refuse options of action values where a loss has none.
+
+    Raises:
+        ValueError: one of them is not the usual one.
+    """
+    for key, value in critic_options(critics).items():
+        if value != USUAL[key]:
+            raise ValueError(
+                f"{name}.{key} is of action values, which {loss} has not, got {value}."
+            )

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase, InitTracker, Transform
 from torchrl.objectives import LossModule, ValueEstimators
 
 from saferl.algorithms.base import Agent, Algorithm
-from saferl.algorithms.networks import USUAL, NetworkBuilder, critic_options
+from saferl.algorithms.networks import NetworkBuilder, refuse_options
 from saferl.algorithms.parts import Parts
 from saferl.config.schema import OnPolicyLearning
 from saferl.envs.task import Task
@@ -51,11 +51,7 @@ class OnPolicy(OnPolicyLearning, Algorithm):
                 raise ValueError(
                     f"{loss} has one state value: set {name}=single, got {critics.members} members."
                 )
-            for key, value in critic_options(critics).items():
-                if value != USUAL[key]:
-                    raise ValueError(
-                        f"{name}.{key} is of action values, which {loss} has not, got {value}."
-                    )
+            refuse_options(name, critics, loss)
 
     def loss_parts(self, networks: NetworkBuilder) -> dict[str, Callable[[], Any]]:
         def state_value(out_key: str) -> torch.nn.Module:
