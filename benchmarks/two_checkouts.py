@@ -31,7 +31,7 @@ def learner_of(cfg: Any) -> Any:
         from saferl.builders import build_learner
 
         return build_learner(cfg, build_agent(cfg).loss)
-    return algorithm_of(cfg).learner(build_agent(cfg).loss, cfg.compile)
+    return algorithm_of(cfg.learning).learner(build_agent(cfg).loss, cfg.compile)
 
 
 def serve(overrides: list[str], options: Any) -> None:

@@ -96,7 +96,7 @@ def learner(overrides: list[str], device: str, compile: bool) -> Learner:
         fixed = ["task.observation=world", f"device={device}", f"compile={compile}"]
         cfg = compose("config", [*overrides, *fixed])
     torch.manual_seed(0)
-    return algorithm_of(cfg).learner(build_agent(cfg).loss, cfg.compile)
+    return algorithm_of(cfg.learning).learner(build_agent(cfg).loss, cfg.compile)
 
 
 def main() -> None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, get_type_hints
 
 import hydra
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase, RewardSum, Transform, TransformedEnv
 from torchrl.envs.transforms import Compose
@@ -57,18 +57,18 @@ def build_env(
     return TransformedEnv(env, Compose(*transforms)) if transforms else env  # pyright: ignore
 
 
-def complete(cfg: DictConfig) -> None:
-    """Write into a configuration what its task takes from the environment itself.
+def complete(node: DictConfig) -> None:
+    """Write into a node of the group ``task`` what the task takes from the environment itself.
 
     Raises:
         ValueError: the task's settings cannot be meant.
     """
-    if "reward" in cfg.task and "reward" not in (arguments(cfg.task._target_) or {"reward"}):
+    if "reward" in node and "reward" not in (arguments(node._target_) or {"reward"}):
         raise ValueError(
-            f"shaping changes the road's reward, which task={cfg.task.task} has not: set shaping=none."
+            f"shaping changes the road's reward, which task={node.task} has not: set shaping=none."
         )
-    check_targets(cfg.task, "task")
-    OmegaConf.update(cfg, "task", hydra.utils.instantiate(cfg.task).complete())
+    check_targets(node, "task")
+    node.merge_with(hydra.utils.instantiate(node).complete())
 
 
 def build_loggers(sinks: Sequence[DictConfig], run: Path) -> list:
@@ -87,9 +87,9 @@ def build_loggers(sinks: Sequence[DictConfig], run: Path) -> list:
         ) from error
 
 
-def algorithm_of(cfg: DictConfig) -> Algorithm:
-    """The family of a run's algorithm, with its settings."""
-    return hydra.utils.instantiate(cfg.learning, _convert_="all")
+def algorithm_of(learning: DictConfig) -> Algorithm:
+    """An algorithm of its family, from a node of the group ``learning``."""
+    return hydra.utils.instantiate(learning, _convert_="all")
 
 
 def build_agent(cfg: DictConfig) -> Agent:
@@ -98,7 +98,7 @@ def build_agent(cfg: DictConfig) -> Agent:
     Raises:
         ValueError: parts that do not go together.
     """
-    return algorithm_of(cfg).agent(Parts.of(cfg))
+    return algorithm_of(cfg.learning).agent(Parts.of(cfg))
 
 
 def load_agent(cfg: DictConfig, path: Path, name: str) -> Agent:
@@ -113,19 +113,25 @@ def load_agent(cfg: DictConfig, path: Path, name: str) -> Agent:
     return agent
 
 
-def begin_from(agent: Agent, cfg: DictConfig, path: Path) -> None:
-    """Give an agent the networks of another run; all else stays as ``cfg`` says.
+def begin_from(agent: Agent, architecture: Mapping[str, Any], path: Path, device: str) -> None:
+    """Give an agent the networks of another run; all else stays as it is.
+
+    Args:
+        agent: that begins.
+        architecture: what decides whether networks fit it (``Algorithm.architecture``).
+        path: the run.
+        device: the agent's.
 
     Raises:
         FileNotFoundError: there is no checkpoint.
         ValueError: another architecture; names the options that differ.
     """
     found, other = latest(path, "init"), run_config(path, "init")
-    other.device = cfg.device
-    ours, theirs = (algorithm_of(c).architecture(Parts.of(c)) for c in (cfg, other))
+    other.device = device
+    theirs = algorithm_of(other.learning).architecture(Parts.of(other))
     differing = {
         key: f"{key} is {theirs[key]} there and {value} here"
-        for key, value in ours.items()
+        for key, value in architecture.items()
         if key in theirs and theirs[key] != value
     }
     error = f"init: the networks of {path} do not fit: {', '.join(differing.values())}."
@@ -150,15 +156,15 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         ValueError: something in the configuration cannot be meant; names the key.
         FileNotFoundError: ``init`` names no checkpoint.
     """
-    complete(cfg)
+    complete(cfg.task)
     check(cfg)
     torch.set_num_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
-    algorithm, parts = algorithm_of(cfg), Parts.of(cfg)
+    algorithm, parts = algorithm_of(cfg.learning), Parts.of(cfg)
     check_task(cfg.evaluation, parts.task)
     agent, num_envs = algorithm.agent(parts), cfg.env.num_envs
     if cfg.init and not (run / FOLDER).exists():  # a run that goes on has its own networks
-        begin_from(agent, cfg, Path(cfg.init))
+        begin_from(agent, algorithm.architecture(parts), Path(cfg.init), cfg.device)
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
     transforms: list[Any] = [sums, *algorithm.transforms()]
     if agent.projector is not None:

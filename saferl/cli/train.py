@@ -26,7 +26,7 @@ def train(cfg: DictConfig) -> None:
     resuming = cfg.resume is not None
     if not resuming:
         run = Path(HydraConfig.get().runtime.output_dir)
-        complete(cfg)
+        complete(cfg.task)
         OmegaConf.resolve(cfg)
         claim(run, cfg)
     else:

@@ -72,12 +72,12 @@ def test_every_leaf_is_read_by_a_training(
     cfg = compose(*SMALL, f"algo={algo}", *TASKS[task])
     if task in ("cart", "gym") and cfg.task.get("reward"):
         pytest.skip("refused: a shaped reward is the road's")
-    assemble.complete(cfg)
+    assemble.complete(cfg.task)
     check(cfg)
     names, seen = watched(cfg)
     assert not seen
     # What has been checked reads everything, and so shows nothing.
-    monkeypatch.setattr(assemble, "complete", lambda cfg: None)
+    monkeypatch.setattr(assemble, "complete", lambda node: None)
     monkeypatch.setattr(assemble, "check", lambda cfg: None)
     trainer = assemble.build_trainer(cfg, tmp_path)
     trainer.train()

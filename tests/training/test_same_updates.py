@@ -35,7 +35,7 @@ def learner(*overrides: str, algo: str = "arsac", compile: bool = False) -> Lear
                 parameter.normal_(std=0.3)
     return Learner(
         loss,
-        algorithm_of(cfg).optimizer(loss),
+        algorithm_of(cfg.learning).optimizer(loss),
         SoftUpdate(loss, tau=cfg.learning.tau),
         compile=compile,
     )

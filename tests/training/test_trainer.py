@@ -363,8 +363,8 @@ def test_trainer_refuses(name: str, value: int, tmp_path: Path):
 
 
 def test_two_runs_that_start_at_once_do_not_share_a_folder(refusal, monkeypatch, tmp_path: Path):
-    def complete(cfg):
-        assemble.complete(cfg)
+    def complete(node):
+        assemble.complete(node)
         commands.claim(tmp_path / "run", OmegaConf.create({"seed": 7}))  # faster by a moment
 
     monkeypatch.setattr(commands, "complete", complete)
