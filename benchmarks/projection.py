@@ -64,11 +64,8 @@ def main() -> None:
     torch.manual_seed(0)
     cfg = run_config(args.run)
     cfg.device = "cpu"
-    cfg.device = "cpu"
     agent = load_agent(cfg, args.run, "run")
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(cfg.learning.buffer_size), generator=torch.Generator()
-    )
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(cfg.learning.buffer_size))
     Checkpoint(buffer=BufferState(buffer)).load(latest(args.run))
     index = torch.randperm(len(buffer))[: args.samples]
     data = buffer[index].select("ego", "vehicles")

@@ -23,8 +23,7 @@ def make(num_envs=1, seed=0, **settings):
 
 def reset(env, seeds=None):
     """Reset all environments, maybe to given episodes."""
-    fields = {"seed": torch.as_tensor(seeds)} if seeds is not None else {}
-    return env.reset(TensorDict(fields, batch_size=env.batch_size))
+    return env.reset(seeds=seeds)
 
 
 def reset_rows(env, view, rows):

@@ -73,9 +73,9 @@ class TableEnv(SeededEnv):
         self._where = (4 * uniform(self._seeds + (self._steps << 32), 0)).long()
         return torch.nn.functional.one_hot(self._where, 4).float()
 
-    def _reset(self, tensordict=None, **kwargs):
+    def _reset(self, tensordict=None, seeds=None, **kwargs):
         reset = self._reset_mask(tensordict)
-        self._seeds = torch.where(reset, self._next_seeds(tensordict, reset), self._seeds)
+        self._seeds = torch.where(reset, self._next_seeds(reset, seeds), self._seeds)
         self._steps = torch.where(reset, 0, self._steps)
         return TensorDict({"observation": self._observe()}, batch_size=self.batch_size)
 

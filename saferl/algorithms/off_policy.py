@@ -88,10 +88,11 @@ class OffPolicy(OffPolicyLearning, Algorithm):
                 f"and {collected}."
             )
         device = next(agent.loss.parameters()).device
+        generator = torch.Generator(device).manual_seed(seed)
         buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(self.buffer_size, device=device),
             batch_size=self.batch_size,
-            generator=torch.Generator(device).manual_seed(seed),
+            generator=generator,
         )
         buffer.append_transform(RewardScaling(0.0, self.reward_scale, in_keys=[("next", "reward")]))
         if agent.projector is not None:
@@ -104,6 +105,7 @@ class OffPolicy(OffPolicyLearning, Algorithm):
             demonstrate=partial(self.demonstrate, task, build_env, num_envs, seed)
             if self.demonstrations
             else None,
+            generator=generator,
         )
 
     @torch.no_grad()

@@ -98,12 +98,13 @@ class OnPolicy(OnPolicyLearning, Algorithm):
                 f"(learning.rollout_frames), got {self.batch_size}."
             )
         device = next(agent.loss.parameters()).device
+        generator = torch.Generator(device).manual_seed(seed)
         buffer = TensorDictReplayBuffer(
             storage=LazyTensorStorage(frames, device=device),
             # Without the rest of an epoch: a small batch would weigh as much as a whole one.
             sampler=SamplerWithoutReplacement(drop_last=True),
             batch_size=self.batch_size,
-            generator=torch.Generator(device).manual_seed(seed),
+            generator=generator,
         )
         return Epochs(
             buffer,
@@ -111,6 +112,7 @@ class OnPolicy(OnPolicyLearning, Algorithm):
             begin=learner.begin,
             epochs=self.epochs,
             reward_scale=self.reward_scale,
+            generator=generator,
         )
 
 

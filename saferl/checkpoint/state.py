@@ -74,10 +74,11 @@ class BufferState:
 
     Args:
         buffer: without prefetching, over a tensor storage.
+        generator: that it was given; None: it samples by torch's own.
     """
 
-    def __init__(self, buffer: ReplayBuffer):
-        self.buffer = buffer
+    def __init__(self, buffer: ReplayBuffer, generator: torch.Generator | None = None):
+        self.buffer, self.generator = buffer, generator
 
     def state_dict(self) -> dict[str, Any]:
         """Rows [n, ...], writer, sampler and generator."""
@@ -87,7 +88,7 @@ class BufferState:
             "rows": buffer.storage[:count].to_dict() if count else {},
             "writer": buffer.writer.state_dict(),
             "sampler": buffer.sampler.state_dict(),
-            "generator": None if buffer._rng is None else buffer._rng.get_state(),
+            "generator": None if self.generator is None else self.generator.get_state(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -107,8 +108,8 @@ class BufferState:
             buffer.storage.set(range(count), rows)  # pyright: ignore[reportArgumentType]
         buffer.writer.load_state_dict(state["writer"])
         buffer.sampler.load_state_dict(state["sampler"])
-        if state["generator"] is not None:
-            buffer._rng.set_state(state["generator"].cpu())
+        if self.generator is not None:
+            self.generator.set_state(state["generator"].cpu())
 
 
 class GrowingFiles:

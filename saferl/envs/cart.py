@@ -13,6 +13,7 @@ import torch
 from scipy.linalg import solve_discrete_are
 from scipy.optimize import brentq
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 
 from saferl.envs.seeding import SeededEnv, uniform
@@ -137,9 +138,11 @@ class CartEnv(SeededEnv):
         ]
         self.set_seed(seed)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, seeds: Tensor | None = None, **kwargs
+    ) -> TensorDictBase:
         reset = self._reset_mask(tensordict)
-        self._seeds = torch.where(reset, self._next_seeds(tensordict, reset), self._seeds)
+        self._seeds = torch.where(reset, self._next_seeds(reset, seeds), self._seeds)
         self._steps = torch.where(reset, 0, self._steps)
         drawn = torch.stack([uniform(self._seeds, stream) for stream in (0, 1)], -1)
         start = ((2 * drawn - 1) * self.task.spread).to(self._state)

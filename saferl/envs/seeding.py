@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 
 from saferl.envs.task import Task
 
@@ -48,8 +48,8 @@ def episode_seeds(seed: int, count: int) -> Tensor:
 class SeededEnv(EnvBase):
     """A batch of environments, each with its own sequence of seeded episodes; ``reward`` and ``cost`` [B, 1].
 
-    A reset may be told which episodes to play by an int64 key ``seed`` [B] or [B, 1]; without it every
-    environment goes on in its own sequence, which follows from ``set_seed``.
+    ``env.reset(seeds=...)`` plays the episodes of these seeds (int64 [B]), with or without transforms around the
+    environment. Without them every environment goes on in its own sequence, which follows from ``set_seed``.
 
     Args:
         task: its settings.
@@ -88,11 +88,10 @@ class SeededEnv(EnvBase):
         self._stream = mix(mix(torch.full_like(index, int(seed or 0)), 0) + index, 0)
         self._episode = torch.zeros_like(self._stream)
 
-    def _next_seeds(self, tensordict: TensorDictBase | None, reset: Tensor) -> Tensor:
-        """Episode seeds [B] (31 bits) for the environments in ``reset`` [B]; advances those alone."""
-        given = None if tensordict is None else tensordict.get("seed", None)
-        if given is not None:
-            return given.reshape(self.batch_size).to(torch.int64)
+    def _next_seeds(self, reset: Tensor, seeds: Tensor | None = None) -> Tensor:
+        """Episode seeds [B] (31 bits) for the environments in ``reset`` [B], or those given; else advances those alone."""
+        if seeds is not None:
+            return torch.as_tensor(seeds, device=self.device).reshape(self.batch_size)
         seeds = mix(self._stream, self._episode) & U31
         self._episode = self._episode + reset
         return seeds
@@ -110,22 +109,6 @@ class SeededEnv(EnvBase):
         for name in self.kept:
             value = state_dict[name.lstrip("_")]
             setattr(self, name, value.to(self.device or "cpu").clone())
-
-
-def start(env: EnvBase, seeds: Tensor) -> TensorDictBase:
-    """Reset an environment, with or without transforms, to the episodes of these seeds.
-
-    TorchRL's ``TransformedEnv.reset`` keeps every key but the environment's state from it, so a
-    ``seed`` must reach the environment itself.
-
-    Args:
-        env: batch size [B].
-        seeds: int64 [B].
-    """
-    request = TensorDict({"seed": seeds}, batch_size=env.batch_size)
-    if not isinstance(env, TransformedEnv):
-        return env.reset(request)
-    return env.transform._reset(request.empty(), env.base_env.reset(request))
 
 
 class ReplayedEnv(SeededEnv):
@@ -164,10 +147,12 @@ class ReplayedEnv(SeededEnv):
             self._actions[index].append(action)
             self._last[index] = self._advance(index, action)
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, seeds: Tensor | None = None, **kwargs
+    ) -> TensorDictBase:
         reset = self._reset_mask(tensordict)
         self._seeds = torch.where(
-            reset, self._next_seeds(tensordict, reset), self._seeds.to(reset.device)
+            reset, self._next_seeds(reset, seeds), self._seeds.to(reset.device)
         ).cpu()
         for index in reset.nonzero().flatten().tolist():
             self._reset_one(index)

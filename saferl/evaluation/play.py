@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
-from saferl.envs.seeding import episode_seeds, start
+from saferl.envs.seeding import episode_seeds
 from saferl.envs.task import Task
 from saferl.evaluation.rows import episode_rows
 
@@ -40,7 +40,7 @@ def play(
     """
     steps = []
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        tensordict = start(env, seeds)
+        tensordict = env.reset(seeds=seeds)
         alive = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
         while alive.any():
             tensordict = env.step(policy(tensordict))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer
@@ -26,6 +27,7 @@ class Replay:
         warmup_frames: collected before the first batch.
         demonstrate: gives transitions [N] that the buffer holds before the first frame, or None; they
             count as no frames.
+        generator: that the buffer was given, for checkpoints.
 
     Raises:
         ValueError: a number out of range.
@@ -38,6 +40,7 @@ class Replay:
         updates_per_frame: float = 0.25,
         warmup_frames: int = 1000,
         demonstrate: Callable[[], TensorDictBase] | None = None,
+        generator: torch.Generator | None = None,
     ):
         for name, value, least in (
             ("updates_per_frame", updates_per_frame, 0),
@@ -46,6 +49,7 @@ class Replay:
             if value < least:
                 raise ValueError(f"{name} must be >= {least}, got {value}.")
         self.buffer, self.stored = buffer, stored
+        self.buffer_state = BufferState(buffer, generator)
         self.updates_per_frame, self.warmup_frames = updates_per_frame, warmup_frames
         self.demonstrate = demonstrate
         self.owed = 0.0
@@ -67,10 +71,10 @@ class Replay:
             yield self.buffer.sample()
 
     def state_dict(self) -> dict[str, Any]:
-        return {**BufferState(self.buffer).state_dict(), "owed": self.owed}
+        return {**self.buffer_state.state_dict(), "owed": self.owed}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        BufferState(self.buffer).load_state_dict(state)
+        self.buffer_state.load_state_dict(state)
         self.owed = state["owed"]
 
 
@@ -78,11 +82,12 @@ class Epochs:
     """Each batch of fresh transitions is gone through a few times in mini-batches, and forgotten.
 
     Args:
-        buffer: as large as a batch, with a generator and a sampler without replacement.
+        buffer: as large as a batch, with a sampler without replacement.
         stored: keys of a transition that the loss reads, where they exist.
         begin: is given each batch [B, T] first, and writes advantages and value targets into it.
         epochs: how often a batch is gone through.
         reward_scale: of the reward that ``begin`` sees.
+        generator: that the buffer was given, for checkpoints.
 
     Raises:
         ValueError: fewer than one epoch.
@@ -95,11 +100,12 @@ class Epochs:
         begin: Callable[[TensorDictBase], Any],
         epochs: int = 10,
         reward_scale: float = 1.0,
+        generator: torch.Generator | None = None,
     ):
         if epochs < 1:
             raise ValueError(f"epochs must be >= 1, got {epochs}.")
         self.buffer, self.stored, self.begin = buffer, stored, begin
-        self.epochs, self.reward_scale = epochs, reward_scale
+        self.epochs, self.reward_scale, self.generator = epochs, reward_scale, generator
 
     def prepare(self) -> None:
         """Nothing is needed before the first frame."""
@@ -117,7 +123,8 @@ class Epochs:
 
     def state_dict(self) -> dict[str, Any]:
         """What shuffles the mini-batches: no transition outlives its batch, and checkpoints are made between them."""
-        return {"generator": self.buffer._rng.get_state()}
+        return {} if self.generator is None else {"generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.buffer._rng.set_state(state["generator"].cpu())
+        if self.generator is not None:
+            self.generator.set_state(state["generator"].cpu())

@@ -103,21 +103,23 @@ def test_the_newest_replaces_the_older(tmp_path: Path):
 def test_buffer_continues_where_it_was(written: int):
     """Empty, partly filled and wrapped round: same rows, same next samples, same next writes."""
 
-    def buffer() -> TensorDictReplayBuffer:
-        return TensorDictReplayBuffer(
-            storage=LazyTensorStorage(8), batch_size=4, generator=torch.Generator().manual_seed(1)
+    def buffer() -> tuple[TensorDictReplayBuffer, BufferState]:
+        generator = torch.Generator().manual_seed(1)
+        made = TensorDictReplayBuffer(
+            storage=LazyTensorStorage(8), batch_size=4, generator=generator
         )
+        return made, BufferState(made, generator)
 
     def transitions(start: int, count: int):
         values = torch.arange(start, start + count)
         return TensorDict({"x": values, "next": {"y": values[:, None] > 2}}, [count])
 
-    ours, theirs = buffer(), buffer()
+    (ours, kept), (theirs, restored) = buffer(), buffer()
     for index in range(written):
         ours.extend(transitions(index, 1))
     if written:
         ours.sample()
-    BufferState(theirs).load_state_dict(BufferState(ours).state_dict())
+    restored.load_state_dict(kept.state_dict())
     assert len(ours) == len(theirs) == min(written, 8)
     for each in (ours, theirs):
         each.extend(transitions(100, 3))

@@ -54,7 +54,7 @@ def test_seeds_decide_episodes_and_state_replays_them():
     assert torch.equal(start, second.reset()["observation"])
     assert not torch.equal(start[0], start[1])
     assert not torch.equal(start, first.reset()["observation"])
-    asked = first.reset(second.reset().empty().set("seed", torch.tensor([[5], [5]])))
+    asked = first.reset(seeds=torch.tensor([5, 5]))
     assert torch.equal(asked["observation"][0], asked["observation"][1])
 
     first.step(constant(0.5)(asked))

@@ -19,7 +19,6 @@ from saferl.envs.intersection import BatchedIntersection, HighwayIntersection, S
 from saferl.envs.intersection.drivers import Driver
 from saferl.envs.intersection.episode import Episode, record
 from saferl.envs.intersection.pictures import EGO, OTHERS, draw, draw_trajectories, save_gif
-from saferl.envs.seeding import start
 from saferl.envs.transforms import SafetyProjector
 
 EMPTY = Scenario(task="rt", vehicles=0, policy_frequency=5)
@@ -172,7 +171,7 @@ def test_both_backends_render_the_same_scene(seed: int):
     pictures = []
     for kind in (BatchedIntersection, HighwayIntersection):
         env = kind(scenario, num_envs=2)
-        start(env, torch.tensor([99, seed]))
+        env.reset(seeds=torch.tensor([99, seed]))
         pictures.append(env.render(1).astype(int))
         assert (pictures[-1] != env.render(0)).any()
     assert pictures[0].shape == (600, 600, 3)
@@ -181,7 +180,7 @@ def test_both_backends_render_the_same_scene(seed: int):
 
 def test_yielding_cars_are_orange():
     env = BatchedIntersection(Scenario(task="gs", vehicles=10), num_envs=1)
-    start(env, torch.tensor([3]))
+    env.reset(seeds=torch.tensor([3]))
     orange = np.array([255, 170, 60])
     for _ in range(20):
         env.step(TensorDict({"action": torch.zeros(1, 2)}, [1]))

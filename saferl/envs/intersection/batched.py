@@ -231,9 +231,11 @@ class BatchedIntersection(IntersectionBase):
         seen = {"ego": "seen_ego", "vehicles": "seen_vehicles", "route": "route"}
         return {key: self._state[name] for key, name in seen.items()}
 
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase | None = None, seeds: Tensor | None = None, **kwargs
+    ) -> TensorDictBase:
         reset = self._reset_mask(tensordict)
-        seeds = self._next_seeds(tensordict, reset)
+        seeds = self._next_seeds(reset, seeds)
         if not self._state:
             self._state = scenes_last(begin(self.task, seeds))
         order = reset.to(torch.int8).argsort(descending=True, stable=True)

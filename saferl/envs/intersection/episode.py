@@ -21,7 +21,6 @@ from saferl.envs.intersection.geometry import (
     overlap,
 )
 from saferl.envs.intersection.reward import Reward
-from saferl.envs.seeding import start
 
 
 @dataclass
@@ -108,7 +107,7 @@ def record(policy: TensorDictModuleBase, env: EnvBase, seed: int) -> Episode:
     if env.batch_size != torch.Size([1]):
         raise ValueError(f"record needs num_envs=1, got batch size {tuple(env.batch_size)}.")
     base: Any = env.base_env if isinstance(env, TransformedEnv) else env
-    tensordict = start(env, torch.tensor([seed], device=env.device))
+    tensordict = env.reset(seeds=torch.tensor([seed]))
     task = base.task
     episode = Episode(
         seed,
