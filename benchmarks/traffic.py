@@ -23,7 +23,7 @@ from tensordict import TensorDict
 
 from saferl.envs.intersection import SCENARIOS, BatchedIntersection, HighwayIntersection, Scenario
 from saferl.envs.intersection.batched import vehicles_of
-from saferl.envs.intersection.cost import CollisionCost
+from saferl.envs.intersection.collision_cost import CollisionCost
 from saferl.envs.intersection.drivers import CautiousDriver, Driver
 from saferl.envs.intersection.geometry import LENGTH, separation
 from saferl.envs.intersection.roads import lane_frames, lanes

@@ -65,7 +65,7 @@ DOORS |= {"catalog": "config"}
 
 
 def part(name: str) -> str:
-    """``saferl.envs.intersection.cost`` is of the part ``envs``; ``saferl`` itself of ``""``."""
+    """``saferl.envs.intersection.collision_cost`` is of the part ``envs``; ``saferl`` itself of ``""``."""
     return [*name.split("."), ""][1]
 
 
@@ -76,7 +76,7 @@ def foreign(name: str) -> set[str]:
 
 def test_the_walk_sees_the_package():
     assert {part(name) for name in MODULES} == {"", *ROOMS, *DOORS}
-    assert "saferl.envs.intersection.geometry" in GRAPH["saferl.envs.intersection.cost"]
+    assert "saferl.envs.intersection.geometry" in GRAPH["saferl.envs.intersection.collision_cost"]
     assert "saferl.modules.projection" in GRAPH["saferl.envs.transforms.projector"]
 
 

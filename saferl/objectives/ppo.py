@@ -16,7 +16,7 @@ from torchrl.objectives.utils import distance_loss
 from saferl.modules import BoundCritics, CriticEnsemble, LagrangeMultiplier, Largest
 from saferl.objectives.advantages import CostValueKeys, CostValueMixin
 from saferl.objectives.checks import check_begun, check_lagrange
-from saferl.objectives.cost import quantile_loss
+from saferl.objectives.cost_terms import quantile_loss
 
 
 class PPOLagLoss(CostValueMixin, ClipPPOLoss):

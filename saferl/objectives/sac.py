@@ -23,7 +23,7 @@ from torchrl.objectives.sac import compute_rsample_log_prob
 from saferl.modules import LagrangeMultiplier
 from saferl.objectives.adapter import SACTerms
 from saferl.objectives.checks import check_choice, count_members
-from saferl.objectives.cost import CostBackup, CostCriticMixin, CostTarget, SharedTerms
+from saferl.objectives.cost_terms import CostBackup, CostCriticMixin, CostTarget, SharedTerms
 
 #: What weighs the entropy's distance from its target in the temperature's term.
 AlphaWeight = Literal["alpha", "log_alpha"]

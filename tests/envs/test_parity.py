@@ -20,7 +20,7 @@ from tensordict import TensorDict
 from saferl.envs.intersection import SCENARIOS, IntersectionEnv, Scenario, Traffic
 from saferl.envs.intersection.base import OUTCOMES
 from saferl.envs.intersection.batched import advance, begin, look, vehicles_of
-from saferl.envs.intersection.cost import CollisionCost
+from saferl.envs.intersection.collision_cost import CollisionCost
 from saferl.envs.intersection.drivers import CautiousDriver
 from saferl.envs.intersection.geometry import ARM, LENGTH, WIDTH, frame, overlap
 from saferl.envs.intersection.network import build_network

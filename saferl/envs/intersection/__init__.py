@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from saferl.envs.intersection.base import IntersectionBase, Scenario
 from saferl.envs.intersection.batched import BatchedIntersection
-from saferl.envs.intersection.cost import CollisionCost
+from saferl.envs.intersection.collision_cost import CollisionCost
 from saferl.envs.intersection.registration import register
 from saferl.envs.intersection.reward import Reward
 from saferl.envs.intersection.spawning import SCENARIOS, Traffic

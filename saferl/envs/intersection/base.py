@@ -19,7 +19,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from saferl.envs.intersection.cost import CollisionCost
+from saferl.envs.intersection.collision_cost import CollisionCost
 from saferl.envs.intersection.drivers import DRIVERS
 from saferl.envs.intersection.geometry import ROUTES, ROUTES_OF_TASK
 from saferl.envs.intersection.observation import FORMS, ROWS, Form, reading

@@ -11,7 +11,7 @@ import torch
 from gymnasium import spaces
 
 from saferl.envs.intersection.base import STANDING, SUBSTEPS, Scenario, build
-from saferl.envs.intersection.cost import CollisionCost
+from saferl.envs.intersection.collision_cost import CollisionCost
 from saferl.envs.intersection.dynamics import to_physical
 from saferl.envs.intersection.geometry import (
     ROUTES,

@@ -10,7 +10,7 @@ import shapely
 import torch
 from shapely import affinity
 
-from saferl.envs.intersection.cost import CollisionCost
+from saferl.envs.intersection.collision_cost import CollisionCost
 
 MASS, INERTIA, L_F, L_R, C_F, C_R = 1412.0, 1536.7, 1.06, 1.85, -128915.5, -85943.6
 BETA = np.linspace(1.2, 1.5, 15)

@@ -19,7 +19,7 @@ from saferl.modules import (
     value_operator,
 )
 from saferl.objectives import SACLagLoss
-from saferl.objectives.cost import quantile_loss
+from saferl.objectives.cost_terms import quantile_loss
 
 SIZE, GAMMA = 3, 0.9
 
