@@ -6,7 +6,9 @@ import json
 import re
 import signal
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import hydra
 import pytest
@@ -21,139 +23,25 @@ from saferl.training.trainer import _interrupts
 
 TRAIN, TEST, EXPORT = ("train", "config"), ("evaluate", "evaluate"), ("export", "export")
 
-MISTAKES = [
-    (TRAIN, "algo=foo", "algo must be one of arppo, arsac, arsac_plus, arsac_signed, asac, cpo, "),
-    (TRAIN, "task=foo", "task must be one of cart, gs, gym, lt, mixed, rt, got 'foo'"),
-    (TRAIN, "encoder=foo", "encoder must be one of mlp, mlp_tanh, mmam, set, got 'foo'"),
-    (TRAIN, "env=foo", "env must be one of batched, cart, gym, highway, got 'foo'"),
-    (TRAIN, "experiment=foo", "quickstart"),
-    (TRAIN, "gama=0.9", "unknown key 'gama' (did you mean gamma?); choose from algo_name, "),
-    (
-        TRAIN,
-        "task.vehicels=3",
-        "unknown key 'task.vehicels' (did you mean vehicles?); choose from task",
-    ),
-    (TRAIN, "task.cost.steps=3", "set it with +task.cost.steps"),
-    (TRAIN, "+task.foo=1", "unknown key task.foo: "),
-    (TRAIN, "+foo=1", "unknown key foo; choose from "),
-    (TRAIN, "gamma", "Error parsing override 'gamma'"),
-    (TRAIN, "gamma=1.2", "gamma must be >= 0 and <= 1, got 1.2"),
-    (TRAIN, "gamma=abc", "gamma must be a number, got 'abc'"),
-    (TRAIN, "gamma=nan", "got nan"),
-    (TRAIN, "cost_limit=-1", "cost_limit must be >= 0, got -1"),
-    (TRAIN, "episodes=0", "episodes must be >= 1, got 0"),
-    (TRAIN, "frames=null", "Give one budget, episodes or frames"),
-    (TRAIN, "episodes=5 frames=10000", "Give one budget, episodes or frames"),
-    (TRAIN, "device=foo", "device must be one of auto, cpu, cuda, got 'foo'"),
-    (TRAIN, "seed=-1", "seed must be >= 0, got -1"),
-    (TRAIN, "learning.lr.actor=0.1", "learning.lr.actor must be a list, got "),
-    (
-        TRAIN,
-        "learning.lr.actor=[1e-3,-1]",
-        "lr.actor must be [first, last], both >= 0, got [0.001, -1.0]",
-    ),
-    (TRAIN, "learning.updates_per_frame=-1", "updates_per_frame must be > 0, got -1.0"),
-    (
-        TRAIN,
-        "learning.buffer_size=10",
-        "buffer_size must be >= learning.batch_size, got 10 and 256",
-    ),
-    (TRAIN, "episodes=null frames=50", "warmup_frames must be <= frames, or nothing is learned"),
-    (TRAIN, "+loss.alpha_init=1", "loss.alpha_init cannot be set: it follows from the rest"),
-    (TRAIN, "algo=sac_lag +env.seed=5", "env.seed cannot be set: it follows from the rest"),
-    (TRAIN, "lagrange.signal.cost_limit=1", "saferl.training.signals.CriticSignal takes nothing"),
-    (TRAIN, "+lagrange.signal.cost_limit=1", "unknown key lagrange.signal.cost_limit"),
-    (TRAIN, "algo=ppo_rs task=cart", "which task=cart has not: set shaping=none"),
-    (TRAIN, "learning.alpha_init=0", "alpha_init must be > 0, got 0.0"),
-    (TRAIN, "evaluation.episodes=0", "evaluation.episodes must be >= 1, got 0"),
-    (TRAIN, "evaluation.drivers=[blind,fast]", "must be among random, blind, scripted, got 'fast'"),
-    (
-        TRAIN,
-        "algo=sac task=cart evaluation.gif=1",
-        "evaluation.gif must be 0, as task=cart draws no pictures, got ",
-    ),
-    (TRAIN, "lagrange.multiplier.lr=0", "lr must be finite and > 0, got 0"),
-    (TRAIN, "task.observation=map", "observation must be one of route, world, got 'map'"),
-    (TRAIN, "task.cost.crash=-1", "cost.crash must be >= 0, got -1"),
-    (TRAIN, "projector.step_size=-1", "step_size must be finite and > 0, got -1"),
-    (TRAIN, "task.reward.reading=foo", "reading must be one of normalised, raw, got 'foo'"),
-    (TRAIN, "task.vehicles=abc", "task.vehicles must be a whole number or null, got 'abc'"),
-    (TRAIN, "env.num_envs=abc", "env.num_envs must be a whole number, got 'abc'"),
-    (TRAIN, "encoder.heads=3", "width must be a multiple of heads, got 32 and 3"),
-    (TRAIN, "lagrange.multiplier.lr=-1", "lr must be finite and > 0, got -1"),
-    (TRAIN, "loss=sac", "takes no cost_critic: set cost_critic=none, or another loss"),
-    (TRAIN, "algo=sac loss=sac_lag", "needs cost_critic, got cost_critic=none"),
-    (TRAIN, "algo=sac projector=gradient", "projector needs cost critics"),
-    (TRAIN, "algo=cpo projector=gradient", "projector needs cost critics Q_c(s, a), which"),
-    (TRAIN, "algo=cpo lagrange=episode", "takes no lagrange: set lagrange=none"),
-    (TRAIN, "algo=cpo learning=off_policy", "OffPolicy learns by losses with a qvalue_network"),
-    (
-        TRAIN,
-        "algo=ppo task=cart learning.rollout_frames=100",
-        "batch_size must be <= 128, the frames of a batch",
-    ),
-    (TRAIN, "algo=ppo learning.rollout_frames=9 env.num_envs=9", "must be <= 9, the frames of a"),
-    (TRAIN, "algo=ppo_lag +loss.clip_epsilom=0.3", "unknown key loss.clip_epsilom"),
-    (TRAIN, "algo=cpo +loss.dampin=3", "unknown key loss.dampin"),
-    (TRAIN, "algo=cpo loss.trust=abc", "loss.trust must be a number, got 'abc'"),
-    (TRAIN, "task=cart task.horizon=0", "task.horizon must be >= 1, got 0"),
-    (
-        TEST,
-        "policy=random task=cart",
-        "policy must be among none: task=cart has no drivers, got 'random'",
-    ),
-    (TRAIN, "algo=ppo critic=twin", "has one state value: set critic=single, got 2 members"),
-    (TRAIN, "algo=ppo_lag lagrange=signed", "CriticSignal needs Q_c(s, a), which PPOLagLoss has"),
-    (TRAIN, "algo=sac risk=mean_std", "SACLoss takes no risk: set risk=none"),
-    (TRAIN, "risk=mean_std cost_critic.members=1", "risk=mean_std is of several members"),
-    (
-        TRAIN,
-        "algo=sac_lag task=cart learning.demonstrations=9",
-        "which task=cart has not: set learning.demonstrations=0",
-    ),
-    (
-        TRAIN,
-        "algo=ppo learning.rollout_frames=abc",
-        "learning.rollout_frames must be a whole number, got 'abc'",
-    ),
-    (TRAIN, "algo=ppo env.num_envs=0", "env.num_envs must be >= 1, got 0"),
-    (TRAIN, "env=cart", "plays a Cart, but task=gs is a Scenario: leave env= to the task"),
-    (TRAIN, "task=gym", "Missing mandatory value: task.id"),
-    (TRAIN, "algo=sac task=gym task.id=No-v0", "task.id: No-v0 cannot be made"),
-    (TRAIN, "resume=missing", "resume: no such file or folder: missing"),
-    (TRAIN, "resume=2025", "resume: no such file or folder: 2025"),
-    (TRAIN, "init=missing", "init: no such file or folder: missing"),
-    (TRAIN, "out=", "out must be a path, got ''"),
-    (TRAIN, "resume=", "resume must be a path, got ''"),
-    (TRAIN, "init=", "init must be a path, got ''"),
-    (
-        TEST,
-        "",
-        "Give one of checkpoint=PATH, pretrained=NAME or policy=random|blind|scripted, got none",
-    ),
-    (TEST, "policy=blind checkpoint=x", "got checkpoint=x and policy=blind"),
-    (TEST, "policy=foo", "policy must be among random, blind, scripted, got 'foo'"),
-    (TEST, "pretrained=foo", "pretrained"),
-    (TEST, "checkpoint=missing", "checkpoint: no such file or folder: missing"),
-    (TEST, "policy=blind episodes=0", "episodes must be >= 1, got 0"),
-    (TEST, "policy=blind task=foo", "task must be one of cart, gs, gym, lt, mixed, rt, got 'foo'"),
-    (TEST, "policy=blind foo=1", "unknown key 'foo'; choose from task, env, checkpoint"),
-    (TEST, "policy=blind out=", "out must be a path, got ''"),
-    (TEST, "checkpoint=", "checkpoint must be a path, got ''"),
-    (EXPORT, "", "checkpoint=... is missing"),
-    (EXPORT, "checkpoint=x out=", "out must be a path, got ''"),
-    (EXPORT, "checkpoint=missing out=x", "checkpoint: no such file or folder: missing"),
-]
+
+def mistakes() -> Iterator[Any]:
+    """Commands, arguments and messages of mistakes.txt."""
+    command = ""
+    for row in Path(__file__).with_name("mistakes.txt").read_text().splitlines()[1:]:
+        if row.startswith("["):
+            command = row.strip("[]")
+        elif row and not row.startswith("#"):
+            arguments, message = row.split("->", 1)
+            given = arguments.replace("(nothing)", "").split()
+            yield pytest.param(command, given, message.strip(), id=" ".join([command, *given]))
 
 
-@pytest.mark.parametrize(
-    ("command_name", "arguments", "message"), MISTAKES, ids=[f"{m[0][0]} {m[1]}" for m in MISTAKES]
-)
+@pytest.mark.parametrize(("command_name", "arguments", "message"), mistakes())
 def test_mistake_is_one_line_and_leaves_nothing(
     command_name, arguments, message, refusal, tmp_path: Path
 ):
-    line = refusal(*command_name, *arguments.split())
-    assert message in line
+    config = "config" if command_name == "train" else command_name
+    assert message in refusal(command_name, config, *arguments)
     assert not list(tmp_path.iterdir())
 
 
