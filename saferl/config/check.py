@@ -10,7 +10,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import hydra
-from omegaconf import DictConfig, ListConfig
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from saferl.config import schema
 from saferl.envs.task import Task
@@ -25,7 +25,12 @@ def check(cfg: DictConfig) -> None:
     Raises:
         ValueError: names the key, the value and what is allowed.
     """
-    schema.check(cfg)
+    if not is_dataclass(
+        OmegaConf.get_type(cfg)
+    ):  # a run's own file, which somebody may have edited
+        schema.check(OmegaConf.merge(OmegaConf.structured(schema.Training), cfg))  # pyright: ignore
+    else:
+        schema.check(cfg)
     check_targets(cfg)
 
 

@@ -36,7 +36,7 @@ def mistakes() -> Iterator[Any]:
             yield pytest.param(command, given, message.strip(), id=" ".join([command, *given]))
 
 
-@pytest.mark.parametrize(("command_name", "arguments", "message"), mistakes())
+@pytest.mark.parametrize(("command_name", "arguments", "message"), [*mistakes()])
 def test_mistake_is_one_line_and_leaves_nothing(
     command_name, arguments, message, refusal, tmp_path: Path
 ):
@@ -121,6 +121,23 @@ def test_init_among_on_policy_algorithms(tmp_path: Path, refusal):
     for algo in ("cpo", "sac"):
         line = refusal(*TRAIN, *SMALL, f"algo={algo}", "task=cart", f"init={first}")
         assert "do not fit: encoder." in line and "torch.nn.Tanh" in line
+
+
+def test_the_file_of_a_run_is_checked_again_when_it_goes_on(tmp_path: Path, refusal):
+    """Somebody may have edited it."""
+    run = tmp_path / "run"
+    cfg = compose(*SMALL, "algo=sac", "task=cart")
+    build_trainer(cfg, run).save()
+    for key, value, words in (
+        ("gamma", 2.0, "gamma must be >= 0 and <= 1, got 2.0"),
+        ("seed", "one", "seed must be a whole number, got 'one'"),
+        ("learning.tau", 3.0, "learning.tau must be >= 0 and <= 1, got 3.0"),
+        ("gama", 0.5, "gama"),
+    ):
+        edited = OmegaConf.create(OmegaConf.to_container(cfg, resolve=True))
+        OmegaConf.update(edited, key, value)
+        OmegaConf.save(edited, run / CONFIG)
+        assert words in refusal(*TRAIN, f"resume={run}")
 
 
 def test_a_test_does_not_change_a_task_that_is_not_the_roads(tmp_path: Path, refusal):
