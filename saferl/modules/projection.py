@@ -106,8 +106,8 @@ def _descend(
     return at
 
 
-_compiled_evaluate = Compiled(_evaluate, "the risk and its gradient", cpp=True)
-_compiled_descend = Compiled(_descend, "the projection", cpp=True)
+_compiled_evaluate = Compiled(_evaluate, "the risk and its gradient", replay=False)
+_compiled_descend = Compiled(_descend, "the projection", replay=False)
 
 
 def project(

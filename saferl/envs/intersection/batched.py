@@ -220,8 +220,8 @@ class BatchedIntersection(IntersectionBase):
         super().__init__(task, num_envs, seed, device)
         self._advance, self._restart = partial(advance, task), partial(restart, task)
         if compile_physics:
-            self._advance = Compiled(self._advance, "the simulation's step")
-            self._restart = Compiled(self._restart, "the simulation's reset")
+            self._advance = Compiled(self._advance, "the simulation's step", cpp=False)
+            self._restart = Compiled(self._restart, "the simulation's reset", cpp=False)
         # So many environments are reset at a time that a step in which a few episodes end is not
         # charged for all of them.
         self._chunk = max(min(num_envs, 32), num_envs // 8)

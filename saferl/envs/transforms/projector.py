@@ -124,7 +124,7 @@ class SafetyProjector(Transform):
         self.settings["compile"] = compile
         self._see = self._look
         if compile:
-            self._see = Compiled(self._look, "the projector's look at a state", cpp=True)
+            self._see = Compiled(self._look, "the projector's look at a state", replay=False)
         self.latencies = deque[float](maxlen=10_000)
         self.start = float(start)
         self.action_key = action_key
