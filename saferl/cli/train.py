@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.transforms import Transform
 
 from saferl.algorithms.assemble import build_trainer, complete
+from saferl.checkpoint.lock import alone
 from saferl.checkpoint.run import CONFIG, FOLDER, run_config, run_folder
 from saferl.cli.evaluate import compiling, measure, pictures, trained_policy
 from saferl.evaluation.compare import side_by_side
@@ -38,23 +39,24 @@ def train(cfg: DictConfig) -> None:
             )
         run = run_folder(Path(str(cfg.resume)), "resume")
         cfg = run_config(run)
-    try:
-        trainer = build_trainer(cfg, run)
-        if resuming:
-            trainer.resume()
-        log.info("%s on %s, seed %d. Files: %s", cfg.algo_name, cfg.task.task, cfg.seed, run)
-        trainer.train()
-    finally:
-        if not resuming and not (run / FOLDER).exists():  # it never began
-            (run / CONFIG).unlink(missing_ok=True)
+    with alone(run, "resume" if resuming else "out"):
+        try:
+            trainer = build_trainer(cfg, run)
+            if resuming:
+                trainer.resume()
+            log.info("%s on %s, seed %d. Files: %s", cfg.algo_name, cfg.task.task, cfg.seed, run)
+            trainer.train()
+        finally:
+            if not resuming and not (run / FOLDER).exists():  # it never began
+                (run / CONFIG).unlink(missing_ok=True)
 
-    cfg = compiling(cfg, False)  # the closing test is over before compiling would pay
-    try:
-        closing_test(cfg, run)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(
-            f"Interrupted in the closing test. Repeat it with resume={run}"
-        ) from None
+        cfg = compiling(cfg, False)  # the closing test is over before compiling would pay
+        try:
+            closing_test(cfg, run)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                f"Interrupted in the closing test. Repeat it with resume={run}"
+            ) from None
 
 
 def closing_test(cfg: DictConfig, run: Path) -> None:

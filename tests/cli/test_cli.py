@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import signal
 import time
@@ -17,6 +18,7 @@ from omegaconf import OmegaConf
 from small import EMPTY, SMALL, compose
 
 from saferl.algorithms.assemble import build_agent, build_trainer, load_agent
+from saferl.checkpoint.lock import alone
 from saferl.checkpoint.run import CONFIG, run_config
 from saferl.evaluation.compare import main as summarise
 from saferl.training.trainer import _interrupts
@@ -121,6 +123,22 @@ def test_init_among_on_policy_algorithms(tmp_path: Path, refusal):
     for algo in ("cpo", "sac"):
         line = refusal(*TRAIN, *SMALL, f"algo={algo}", "task=cart", f"init={first}")
         assert "do not fit: encoder." in line and "torch.nn.Tanh" in line
+
+
+def test_two_processes_do_not_work_on_one_run(tmp_path: Path, refusal, spawn):
+    """The second is told who holds it; a process that was killed holds nothing."""
+    options = (*SMALL, *EMPTY, "algo=sac", "frames=1000000", "save_every=8", "out=run")
+    first = spawn("saferl", *options)
+    while not list((tmp_path / "run/checkpoints").glob("checkpoint-*")):
+        assert first.poll() is None, first.communicate()
+        time.sleep(0.05)
+    line = refusal(*TRAIN, "resume=run")
+    assert f"resume: process {first.pid} on " in line and "wait until it ends, or stop it" in line
+    first.kill()
+    first.wait()
+    with alone(tmp_path / "run", "resume"):
+        assert f"process {os.getpid()} on" in refusal(*TRAIN, "resume=run")
+    assert not (tmp_path / "run/.holder").exists()
 
 
 def test_the_file_of_a_run_is_checked_again_when_it_goes_on(tmp_path: Path, refusal):
