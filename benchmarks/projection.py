@@ -17,12 +17,12 @@ from pathlib import Path
 
 import torch
 from tensordict import TensorDict
-from torchrl.checkpoint import Checkpoint
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from saferl.algorithms.assemble import load_agent
 from saferl.checkpoint.run import latest, run_config
+from saferl.checkpoint.sealed import sealed
 from saferl.checkpoint.state import BufferState
 from saferl.envs.intersection import CollisionCost
 from saferl.envs.intersection.dynamics import step_ego, to_physical
@@ -66,7 +66,7 @@ def main() -> None:
     cfg.device = "cpu"
     agent = load_agent(cfg, args.run, "run")
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(cfg.learning.buffer_size))
-    Checkpoint(buffer=BufferState(buffer)).load(latest(args.run))
+    sealed(buffer=BufferState(buffer)).load(latest(args.run))
     index = torch.randperm(len(buffer))[: args.samples]
     data = buffer[index].select("ego", "vehicles")
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):

@@ -14,6 +14,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation, GlobalRNGState
 
+from saferl.checkpoint.sealed import Damaged, sealed
 from saferl.checkpoint.state import Fitting
 
 CONFIG = "config.yaml"
@@ -33,7 +34,7 @@ class RunCheckpoint:
 
     def __init__(self, run: Path, keep: int = 1, **components: Any):
         self.run = run
-        self.checkpoint = Checkpoint(**components, rng=GlobalRNGState())
+        self.checkpoint = sealed(**components, rng=GlobalRNGState())
         self.rotation = CheckpointRotation(run / FOLDER, keep_last=keep)
 
     def save(self, frames: int, metadata: dict[str, Any]) -> Path:
@@ -58,6 +59,8 @@ def _load(checkpoint: Checkpoint, path: Path) -> None:
     try:
         checkpoint.load(path, strict="error", map_location=_CPU)
     except (CheckpointError, OSError) as error:
+        if isinstance(error.__cause__, Damaged):
+            raise ValueError(f"checkpoint {path} is damaged: {error.__cause__}.") from error
         raise ValueError(
             f"checkpoint {path} does not fit this configuration: {error.__cause__ or error} "
             f"Use the configuration that it was trained with ({CONFIG} in its run)."
@@ -124,7 +127,7 @@ def load_component(path: Path, component: Fitting) -> None:
     Raises:
         ValueError: the parameters do not fit; names the first that differs.
     """
-    _load(Checkpoint().register(component.name, component), path)
+    _load(sealed(**{component.name: component}), path)
 
 
 class _Held:
@@ -146,7 +149,7 @@ def progress(path: Path) -> dict[str, int] | None:
     path, held = latest(path), _Held()
     if "progress" not in Checkpoint.manifest(path)["components"]:
         return None
-    _load(Checkpoint(progress=held), path)
+    _load(sealed(progress=held), path)
     return {name: held.state[name] for name in ("frames", "episodes")}
 
 
@@ -165,7 +168,7 @@ def export(path: Path, folder: Path) -> Path:
     if any((folder / name).exists() for name in (FOLDER, "metrics.csv", EXPORTED)):
         raise ValueError(f"out: {folder} holds a run or a policy already; take another folder.")
     config = run_config(path)
-    checkpoint = Checkpoint(loss=_Held(), progress=_Held())
+    checkpoint = sealed(loss=_Held(), progress=_Held())
     _load(checkpoint, latest(path))
     folder.mkdir(parents=True, exist_ok=True)
     checkpoint.save(folder / EXPORTED, format="archive")

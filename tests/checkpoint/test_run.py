@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import re
 import shutil
 from pathlib import Path
 
@@ -16,7 +17,16 @@ from torchrl.checkpoint import Checkpoint
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from saferl.algorithms.assemble import build_agent, build_trainer, load_agent
-from saferl.checkpoint.run import CONFIG, EXPORTED, RunCheckpoint, export, latest, run_folder
+from saferl.checkpoint.run import (
+    CONFIG,
+    EXPORTED,
+    RunCheckpoint,
+    export,
+    latest,
+    run_config,
+    run_folder,
+)
+from saferl.checkpoint.sealed import digests
 from saferl.checkpoint.state import BufferState, Fitting, GrowingFiles
 from saferl.config.locate import pretrained_run
 
@@ -218,3 +228,37 @@ def test_export_holds_the_networks_alone_and_drives_the_same(run: Path, tmp_path
     assert pretrained_run("gs", root=tmp_path / "shipped") == folder
     with pytest.raises(ValueError, match="pretrained must be one of gs, got 'lt'"):
         pretrained_run("lt", root=tmp_path / "shipped")
+
+
+def damaged(path: Path, how: str) -> None:
+    """Damage a file."""
+    data = bytearray(path.read_bytes())
+    if how == "cut":
+        data = data[:10]
+    elif how == "longer":
+        data += b"\0"
+    elif how == "changed":
+        data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("how", ["cut", "longer", "changed", "gone", "pickle"])
+@pytest.mark.parametrize("file", ["state/*.memmap", "state/meta.json", "state.json", "seal.json"])
+def test_a_damaged_file_is_named_and_left_as_it_is(run: Path, tmp_path: Path, how: str, file: str):
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    (part,) = latest(copy).glob("components/*-loss")
+    path = max(part.glob(file), key=lambda path: path.stat().st_size)
+    if how == "gone":
+        path.unlink()
+    elif how == "pickle":  # as TensorDict would read it, and with a seal that says so
+        path = part / "state/other.pickle"
+        path.write_bytes(pickle.dumps("code"))
+        (part / "seal.json").write_text(json.dumps(digests(part)))
+    else:
+        damaged(path, how)
+    before = {p: p.read_bytes() for p in copy.rglob("*") if p.is_file()}
+    named = "" if path.name == "seal.json" else re.escape(path.name)  # else it names what differs
+    with pytest.raises(ValueError, match=f"is damaged: {part.name}/.*{named}"):
+        load_agent(run_config(copy), copy, "checkpoint")
+    assert before == {p: p.read_bytes() for p in copy.rglob("*") if p.is_file()}
