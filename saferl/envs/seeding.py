@@ -159,7 +159,10 @@ class ReplayedEnv(SeededEnv):
         return self._stack(ended=False)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        for index, action in enumerate(tensordict.get("action").cpu().numpy()):
+        actions = tensordict.get("action").cpu()
+        if not actions.isfinite().all():  # what follows would look like a fault of the environment
+            raise ValueError("the policy gave an action that is not finite.")
+        for index, action in enumerate(actions.numpy()):
             self._step_one(index, action.copy())
         return self._stack(ended=True)
 

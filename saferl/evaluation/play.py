@@ -37,13 +37,19 @@ def play(
     Returns:
         The transitions of every decision, each [B]; ``alive`` [B] (bool) is True up to and including
         the last decision of an episode.
+
+    Raises:
+        ValueError: an action is not finite.
     """
     steps = []
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         tensordict = env.reset(seeds=seeds)
         alive = torch.ones(env.batch_size, dtype=torch.bool, device=env.device)
         while alive.any():
-            tensordict = env.step(policy(tensordict))
+            tensordict = policy(tensordict)
+            if not tensordict["action"].isfinite().all():
+                raise ValueError("the policy gave an action that is not finite.")
+            tensordict = env.step(tensordict)
             steps.append(tensordict.clone().set("alive", alive))
             done = tensordict["next", "done"].squeeze(-1)
             ended(int((alive & done).sum()))

@@ -148,6 +148,7 @@ class Trainer:
 
         Raises:
             KeyboardInterrupt: the first Ctrl-C, after a checkpoint was left; a second one at once.
+            ValueError: an action, a loss term or a parameter is not finite; names it and the frame.
         """
         progress = self.progress
         by_episode = self.budget.episodes is not None
@@ -216,9 +217,23 @@ class Trainer:
         frames = self.progress.frames - self.progress.last_save
         return frames >= self.save_every or minutes >= (self.save_minutes or math.inf)
 
+    def _diverged(self, name: str, value: object) -> ValueError:
+        newest = self.checkpoint.rotation.latest()
+        return ValueError(
+            f"{name} is {value} at frame {self.progress.frames}: the training diverged. Its last good checkpoint is "
+            f"{newest}; smaller learning rates (learning.lr) may help."
+        )
+
     def save(self) -> None:
-        """Write a checkpoint of everything, unless the newest one is of this very frame."""
+        """Write a checkpoint of everything, unless the newest one is of this very frame.
+
+        Raises:
+            ValueError: a parameter is not finite; the checkpoint before stays.
+        """
         if self.progress.last_save < self.progress.frames:
+            for name, parameter in self.learner.loss.named_parameters():
+                if not parameter.isfinite().all():
+                    raise self._diverged(name, "not finite")
             self.progress.last_save = self.progress.frames
             self.checkpoint.save(self.progress.frames, {"episodes": self.progress.episodes})
         self._saved_at = time.monotonic()
@@ -226,6 +241,8 @@ class Trainer:
     def _take(self, data: TensorDictBase) -> TensorDict:
         """Make the updates that a batch entitles to; returns its finished episodes [n]."""
         progress = self.progress
+        if not data["action"].isfinite().all():
+            raise self._diverged("the policy's action", "not finite")
         # Of what was spent when these frames were begun: the last batch of a run is learned from, too.
         self.learner.schedule(self.spent)
         finished = self.window.extend(data)
@@ -258,6 +275,9 @@ class Trainer:
                 key: float(value) / max(self._count, 1) for key, value in sorted(self._sums.items())
             },
         }
+        for key in self._sums:
+            if not math.isfinite(row[key]):
+                raise self._diverged(key, row[key])
         for group in self.learner.optimizer.param_groups:
             row[f"lr_{group['name']}"] = group["lr"]
         self._sums, self._count = {}, 0

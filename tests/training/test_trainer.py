@@ -89,6 +89,34 @@ def test_demonstrations_fill_the_buffer_before_the_first_frame(tmp_path: Path):
         assert torch.equal(stored[key][: len(shown)], shown[key])
 
 
+@pytest.mark.parametrize("algo", ["sac", "arsac", "ppo_lag", "cpo"])
+def test_a_training_that_diverges_stops_and_keeps_its_last_good_checkpoint(algo, tmp_path: Path):
+    """By steps of a size that no network survives."""
+    rates = [f"learning.lr.{name}=[1e30,1e30]" for name in ("actor", "critic")]
+    cfg = compose(*SMALL, *EMPTY, f"algo={algo}", "frames=400", "save_every=8", *rates)
+    with pytest.raises(ValueError, match=r"at frame \d+: the training diverged.*checkpoint-\d+;"):
+        build_trainer(cfg, tmp_path).train()
+    kept = build_trainer(cfg, tmp_path)
+    kept.resume()
+    assert all(p.isfinite().all() for p in kept.learner.loss.parameters())
+    rows = kept.metrics.read()
+    terms = [value for row in rows for key, value in row.items() if key.startswith("loss")]
+    assert all(map(math.isfinite, terms))
+
+
+@pytest.mark.parametrize(
+    "task", [("task=gs",), ("task=gs", "env=highway"), ("task=gym", "task.id=Pendulum-v1")]
+)
+def test_an_action_that_is_not_finite_is_the_policys(task: tuple[str, ...], tmp_path: Path):
+    extra = ["task.cost_key=null"] if "task=gym" in task else ["task.vehicles=0"]
+    options = (*SMALL, "algo=sac", *task, *extra, "learning.exploration=0")
+    trainer = build_trainer(compose(*options), tmp_path)
+    next(trainer.learner.loss.actor_network_params.values(True, True)).data.fill_(torch.nan)
+    trainer.collector.init_random_frames = 0
+    with pytest.raises(ValueError, match="policy.*action.* not finite"):
+        collect(trainer, 1)
+
+
 def test_the_papers_order_with_and_without_a_temperature(tmp_path: Path):
     """What has no temperature has no stage for one."""
     trainer = trainer_of(tmp_path, "algo=sac", "learning.update_order=sequential", "env.num_envs=4")
