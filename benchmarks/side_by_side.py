@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDict
 
 CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
 
@@ -77,3 +78,26 @@ def write(path: Path | None, figures: dict[str, Any]) -> None:
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(figures, indent=2) + "\n")
+
+
+def transitions(batch: int, device: str, rows: int = 11) -> TensorDict:
+    """Random ones with 0 to 10 vehicles in sight, in SI units."""
+    generator = torch.Generator().manual_seed(0)
+
+    def scene() -> dict[str, torch.Tensor]:
+        ego = torch.randn(batch, 9, generator=generator) * 5
+        vehicles = torch.randn(batch, rows, 6, generator=generator) * 10
+        count = torch.randint(0, rows, (batch, 1), generator=generator)
+        vehicles[..., 0] = (torch.arange(rows) < count).float()
+        return {"ego": ego, "vehicles": vehicles * vehicles[..., :1]}
+
+    action = torch.rand(batch, 2, generator=generator) * 2 - 1
+    ended = torch.rand(batch, 1, generator=generator) < 0.02
+    following = {
+        **scene(),
+        "reward": torch.randn(batch, 1, generator=generator),
+        "cost": torch.rand(batch, 1, generator=generator) * 0.1,
+        "done": ended,
+        "terminated": ended,
+    }
+    return TensorDict({**scene(), "action": action, "next": following}, [batch]).to(device)

@@ -19,13 +19,13 @@ import sys
 import time
 from pathlib import Path
 
-from side_by_side import write
+from side_by_side import transitions, write
 
 
 def serve(algo: str, threads: int, width: int, compile: bool, seconds: float) -> None:
     """The child: get ready, say so, wait for a line, and print updates a second."""
     import torch
-    from update import learner, transitions
+    from update import learner
 
     torch.set_num_threads(threads)
     data = transitions(256, "cpu")

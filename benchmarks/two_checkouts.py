@@ -19,7 +19,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from side_by_side import conditions, medians, parser, rate, write
+from side_by_side import conditions, medians, parser, rate, transitions, write
 
 
 def learner_of(cfg: Any) -> Any:
@@ -38,7 +38,6 @@ def serve(overrides: list[str], options: Any) -> None:
     """The child: gets ready, says so, and answers each line, a number of seconds, with a rate."""
     import torch
     from hydra import compose, initialize_config_dir
-    from update import transitions
 
     try:
         from saferl.config.locate import config_dir

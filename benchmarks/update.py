@@ -29,9 +29,8 @@ from pathlib import Path
 
 import torch
 from hydra import compose, initialize_config_dir
-from side_by_side import alternate, conditions, medians, parser, write
+from side_by_side import alternate, conditions, medians, parser, transitions, write
 from straight import StraightSACLag
-from tensordict import TensorDict
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
@@ -39,7 +38,6 @@ from saferl.algorithms.assemble import algorithm_of, build_agent
 from saferl.config.locate import config_dir
 from saferl.training.learner import Learner
 
-ROWS = 11
 PLAIN = ["encoder._target_=plain.PlainMMAM"]
 
 
@@ -66,29 +64,6 @@ class Flops(TorchDispatchMode):
         for func, args, kwargs in self.products:
             func(*args, **kwargs)
         return 1
-
-
-def transitions(batch: int, device: str) -> TensorDict:
-    """Random ones with 0 to 10 vehicles in sight, in SI units."""
-    generator = torch.Generator().manual_seed(0)
-
-    def scene() -> dict[str, torch.Tensor]:
-        ego = torch.randn(batch, 9, generator=generator) * 5
-        vehicles = torch.randn(batch, ROWS, 6, generator=generator) * 10
-        count = torch.randint(0, ROWS, (batch, 1), generator=generator)
-        vehicles[..., 0] = (torch.arange(ROWS) < count).float()
-        return {"ego": ego, "vehicles": vehicles * vehicles[..., :1]}
-
-    action = torch.rand(batch, 2, generator=generator) * 2 - 1
-    ended = torch.rand(batch, 1, generator=generator) < 0.02
-    following = {
-        **scene(),
-        "reward": torch.randn(batch, 1, generator=generator),
-        "cost": torch.rand(batch, 1, generator=generator) * 0.1,
-        "done": ended,
-        "terminated": ended,
-    }
-    return TensorDict({**scene(), "action": action, "next": following}, [batch]).to(device)
 
 
 def learner(overrides: list[str], device: str, compile: bool) -> Learner:
@@ -149,7 +124,7 @@ def main() -> None:
     for kind, tuned in (("straight", False), ("tuned", True)):
         for compile in (False, True):
             with torch.device(device):
-                straight = StraightSACLag(width=width, rows=ROWS, compile=compile, tuned=tuned)
+                straight = StraightSACLag(width=width, rows=11, compile=compile, tuned=tuned)
             name = f"{kind} sac_lag {'compiled' if compile else 'eager'}"
             add(name, straight.update, flat, f"{kind} sac_lag eager" if compile else None)
     ours("torchrl sac", ["algo=sac"])
