@@ -11,6 +11,7 @@ is printed how many graphs torch holds, and how long it took to have them.
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import subprocess
@@ -31,7 +32,8 @@ def learner_of(cfg: Any) -> Any:
         from saferl.builders import build_learner
 
         return build_learner(cfg, build_agent(cfg).loss)
-    return algorithm_of(cfg.learning).learner(build_agent(cfg).loss, cfg.compile)
+    whole = "cfg" in inspect.signature(algorithm_of).parameters  # an older commit
+    return algorithm_of(cfg if whole else cfg.learning).learner(build_agent(cfg).loss, cfg.compile)
 
 
 def serve(overrides: list[str], options: Any) -> None:
@@ -50,7 +52,7 @@ def serve(overrides: list[str], options: Any) -> None:
     with initialize_config_dir(config_dir(), version_base=None):
         cfg = compose("config", overrides[-2:])
         if "policy" in cfg.encoder:  # older commits have settings for each network
-            overrides = [o.replace("encoder.", "encoder.policy.") for o in overrides]
+            overrides = [o.replace("encoder.width", "encoder.policy.width") for o in overrides]
         cfg = compose("config", overrides)
         if "observation" in cfg.task:  # older commits have no other than the world's
             cfg = compose("config", [*overrides, "task.observation=world"])

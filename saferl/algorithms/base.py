@@ -139,7 +139,9 @@ class Algorithm(ABC):
             if name in takes and not present:
                 raise ValueError(f"{loss} needs {name}, got {name}=none.")
         if not groups["cost_critic"]:
-            refuse_options("cost_critic", parts.cost_critic, loss)
+            refuse_options(
+                "cost_critic", parts.cost_critic, "is of cost critics, but cost_critic=none"
+            )
         if parts.projector._target_ is not None and self.risks not in takes:
             raise ValueError(
                 f"projector needs cost critics Q_c(s, a), which {loss} has not: "

@@ -90,14 +90,12 @@ def critic_options(critics: DictConfig) -> dict[str, Any]:
     return {key: USUAL[key] if value is None else value for key, value in given.items()}
 
 
-def refuse_options(name: str, critics: DictConfig, loss: str) -> None:
-    """Refuse options of action values where a loss has none.
+def refuse_options(name: str, critics: DictConfig, reason: str) -> None:
+    """Refuse options of critics that there are not, and say why.
 
     Raises:
         ValueError: one of them is not the usual one.
     """
     for key, value in critic_options(critics).items():
         if value != USUAL[key]:
-            raise ValueError(
-                f"{name}.{key} is of action values, which {loss} has not, got {value}."
-            )
+            raise ValueError(f"{name}.{key} {reason}, got {value}.")

@@ -51,7 +51,7 @@ class OnPolicy(OnPolicyLearning, Algorithm):
                 raise ValueError(
                     f"{loss} has one state value: set {name}=single, got {critics.members} members."
                 )
-            refuse_options(name, critics, loss)
+            refuse_options(name, critics, f"is of action values, which {loss} has not")
 
     def loss_parts(self, networks: NetworkBuilder) -> dict[str, Callable[[], Any]]:
         def state_value(out_key: str) -> torch.nn.Module:

@@ -39,11 +39,13 @@ def alone(run: Path, option: str) -> Iterator[None]:
             f"{option}: {who} works on {run}; wait until it ends, or stop it."
         ) from None
     try:
+        holder.unlink(missing_ok=True)  # of a process that was killed
         since = datetime.now().isoformat(" ", "seconds")
         holder.write_text(f"process {os.getpid()} on {socket.gethostname()} since {since}\n")
         yield
     finally:
-        holder.unlink(missing_ok=True)
-        if [path.name for path in run.iterdir()] == [_LOCK]:  # nothing began
-            (run / _LOCK).unlink()
+        with suppress(OSError):  # the folder may be gone
+            holder.unlink(missing_ok=True)
+            if [path.name for path in run.iterdir()] == [_LOCK]:  # nothing began
+                (run / _LOCK).unlink()
         lock.release()

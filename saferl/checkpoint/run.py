@@ -7,6 +7,7 @@ they lie, and takes single ones out of them.
 from __future__ import annotations
 
 import shutil
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -58,9 +59,13 @@ class RunCheckpoint:
 def _load(checkpoint: Checkpoint, path: Path) -> None:
     try:
         checkpoint.load(path, strict="error", map_location=_CPU)
+    except zipfile.BadZipFile as error:
+        raise ValueError(f"checkpoint {path} is damaged: {error}.") from error
     except (CheckpointError, OSError) as error:
         if isinstance(error.__cause__, Damaged):
             raise ValueError(f"checkpoint {path} is damaged: {error.__cause__}.") from error
+        if "target adapter" in str(error):
+            raise ValueError(f"checkpoint {path} was written by an older saferl.") from error
         raise ValueError(
             f"checkpoint {path} does not fit this configuration: {error.__cause__ or error} "
             f"Use the configuration that it was trained with ({CONFIG} in its run)."

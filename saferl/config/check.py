@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -25,13 +26,22 @@ def check(cfg: DictConfig) -> None:
     Raises:
         ValueError: names the key, the value and what is allowed.
     """
-    if not is_dataclass(
-        OmegaConf.get_type(cfg)
-    ):  # a run's own file, which somebody may have edited
-        schema.check(OmegaConf.merge(OmegaConf.structured(schema.Training), cfg))  # pyright: ignore
-    else:
-        schema.check(cfg)
+    known = cfg
+    if OmegaConf.get_type(cfg) is dict:  # a run's own file, which somebody may have edited
+        known = OmegaConf.merge(OmegaConf.structured(schema.Training), cfg)
+        _as_they_are(cfg, known)
+    schema.check(known)  # pyright: ignore[reportArgumentType]
     check_targets(cfg)
+
+
+def _as_they_are(node: Any, known: Any, path: str = "") -> None:
+    """Refuse text that the schema would read as something else: what is built reads the file's own node."""
+    for key, value in node.items():
+        if isinstance(value, DictConfig) and isinstance(known[key], DictConfig):
+            _as_they_are(value, known[key], f"{path}{key}.")
+        elif isinstance(value, str) and not isinstance(known[key], str):
+            kind = _KINDS.get(type(known[key]), "no text")
+            raise ValueError(f"{path}{key} must be {kind}, got {value!r}.")
 
 
 def check_task(evaluation: Any, task: Task) -> None:
@@ -90,6 +100,10 @@ def arguments(target: str) -> dict[str, Any] | None:
         function = hydra.utils.get_object(target)
     except Exception as error:
         raise ValueError(f"_target_ names nothing that can be imported: {target!r}.") from error
+    kinds: dict[str, Any] = {}
+    if is_dataclass(function):  # whose fields may come from other modules
+        with suppress(NameError):
+            kinds = get_type_hints(function)
     # A metaclass, as TorchRL's environments have, hides what __init__ takes.
     function = function.__init__ if inspect.isclass(function) else function
     if function is object.__init__:
@@ -101,7 +115,11 @@ def arguments(target: str) -> dict[str, Any] | None:
     parameters = signature.parameters
     if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values()):
         return None
-    return {name: p.annotation for name, p in parameters.items() if name != "self"}
+    return {
+        name: kinds.get(name, parameter.annotation)
+        for name, parameter in parameters.items()
+        if name != "self"
+    }
 
 
 def fits(value: Any, kind: Any) -> bool:

@@ -48,8 +48,9 @@ def episode_seeds(seed: int, count: int) -> Tensor:
 class SeededEnv(EnvBase):
     """A batch of environments, each with its own sequence of seeded episodes; ``reward`` and ``cost`` [B, 1].
 
-    ``env.reset(seeds=...)`` plays the episodes of these seeds (int64 [B]), with or without transforms around the
-    environment. Without them every environment goes on in its own sequence, which follows from ``set_seed``.
+    ``env.reset(seeds=...)`` plays the episodes of these seeds, B integers, with or without transforms around the
+    environment; the sequences stand still. Without them every environment goes on in its own sequence, which follows
+    from ``set_seed``.
 
     Args:
         task: its settings.
@@ -89,9 +90,11 @@ class SeededEnv(EnvBase):
         self._episode = torch.zeros_like(self._stream)
 
     def _next_seeds(self, reset: Tensor, seeds: Tensor | None = None) -> Tensor:
-        """Episode seeds [B] (31 bits) for the environments in ``reset`` [B], or those given; else advances those alone."""
+        """The given ``seeds`` [B]; without them the next of each sequence (31 bits), which goes on where ``reset`` [B] says."""
         if seeds is not None:
-            return torch.as_tensor(seeds, device=self.device).reshape(self.batch_size)
+            return torch.as_tensor(seeds, dtype=torch.int64, device=self.device).reshape(
+                self.batch_size
+            )
         seeds = mix(self._stream, self._episode) & U31
         self._episode = self._episode + reset
         return seeds

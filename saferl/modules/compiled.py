@@ -49,15 +49,15 @@ class Compiled:
 
     Tensors that are no arguments, such as parameters, are read where they are: change them in place. All else is as
     it was at the first call: a number or an attribute that the function looks up, and what it decided by them; to read
-    a tensor's value is refused. No gradient flows out of what is returned; on a GPU it is valid until the next call
-    (but without ``replay``).
+    a tensor's value is refused. No gradient flows out of what is returned. With ``replay``, on a GPU, it is valid only
+    until the next call.
 
     Args:
         function: of nested containers of tensors and constants, TensorDicts among them.
         name: of what is compiled, for the log.
         replay: on a GPU, whether the kernels are replayed as a CUDA graph. If not, what is returned stays valid and may be
             given back.
-        cpp: on a CPU, whether the kernels are called from C++, all in one file, for which torch's headers are read once. It
+        cpp: on a CPU, whether the kernels are called from C++, all in one file, so that torch's headers are read once. This
             halves the time to compile hundreds of small kernels; a few large ones compile and run faster apart.
 
     Attributes:

@@ -37,5 +37,5 @@ class Encoder:
         raise NotImplementedError
 
     def settings(self, *without: str) -> dict[str, Any]:
-        """The fields by name, but for those ``without`` which a network does."""
+        """All fields by name, except the ones given."""
         return {name: value for name, value in vars(self).items() if name not in without}

@@ -7,7 +7,7 @@ import math
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -63,6 +63,15 @@ def _interrupts() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
+def _not_finite(values: Mapping[str, Any]) -> list[str]:
+    """Names of the tensors that hold a number that is not finite."""
+    return [
+        name
+        for name, value in values.items()
+        if isinstance(value, Tensor) and value.is_floating_point() and not value.isfinite().all()
+    ]
+
+
 @dataclass
 class Trainer:
     """Trains from built parts; it knows none of them by name.
@@ -105,6 +114,8 @@ class Trainer:
         self.metrics = CsvLog(self.run / "metrics.csv")
         self.timing = CsvLog(self.run / "timing.csv")
         self._sums: dict[str, Tensor] = {}
+        # Buffers that are to be filled.
+        self._empty = set(_not_finite(dict(self.learner.loss.named_buffers())))
         self._count = 0
         self._loggers: Sequence[Logger] = ()
         self._saved_at = time.monotonic()
@@ -217,23 +228,35 @@ class Trainer:
         frames = self.progress.frames - self.progress.last_save
         return frames >= self.save_every or minutes >= (self.save_minutes or math.inf)
 
-    def _diverged(self, name: str, value: object) -> ValueError:
+    def _diverged(self, name: str) -> ValueError:
         newest = self.checkpoint.rotation.latest()
+        if newest is None:
+            return ValueError(
+                f"{name} is not finite before the first update; look at what init= names."
+            )
         return ValueError(
-            f"{name} is {value} at frame {self.progress.frames}: the training diverged. Its last good checkpoint is "
+            f"{name} is not finite at frame {self.progress.frames}: the training diverged. Its last good checkpoint is "
             f"{newest}; smaller learning rates (learning.lr) may help."
         )
+
+    def _check_finite(self) -> None:
+        """Refuse to go on, or to be kept, with a number that is not finite.
+
+        Raises:
+            ValueError: names the first one.
+        """
+        for name in _not_finite(self._sums) + _not_finite(self.learner.loss.state_dict()):
+            if name not in self._empty:
+                raise self._diverged(name)
 
     def save(self) -> None:
         """Write a checkpoint of everything, unless the newest one is of this very frame.
 
         Raises:
-            ValueError: a parameter is not finite; the checkpoint before stays.
+            ValueError: something that is learned is not finite; the checkpoint before stays.
         """
         if self.progress.last_save < self.progress.frames:
-            for name, parameter in self.learner.loss.named_parameters():
-                if not parameter.isfinite().all():
-                    raise self._diverged(name, "not finite")
+            self._check_finite()
             self.progress.last_save = self.progress.frames
             self.checkpoint.save(self.progress.frames, {"episodes": self.progress.episodes})
         self._saved_at = time.monotonic()
@@ -242,7 +265,7 @@ class Trainer:
         """Make the updates that a batch entitles to; returns its finished episodes [n]."""
         progress = self.progress
         if not data["action"].isfinite().all():
-            raise self._diverged("the policy's action", "not finite")
+            raise self._diverged("the policy's action")
         # Of what was spent when these frames were begun: the last batch of a run is learned from, too.
         self.learner.schedule(self.spent)
         finished = self.window.extend(data)
@@ -277,7 +300,7 @@ class Trainer:
         }
         for key in self._sums:
             if not math.isfinite(row[key]):
-                raise self._diverged(key, row[key])
+                raise self._diverged(key)
         for group in self.learner.optimizer.param_groups:
             row[f"lr_{group['name']}"] = group["lr"]
         self._sums, self._count = {}, 0

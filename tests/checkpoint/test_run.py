@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import pickle
 import re
@@ -242,8 +243,16 @@ def damaged(path: Path, how: str) -> None:
     path.write_bytes(data)
 
 
-@pytest.mark.parametrize("how", ["cut", "longer", "changed", "gone", "pickle"])
-@pytest.mark.parametrize("file", ["state/*.memmap", "state/meta.json", "state.json", "seal.json"])
+@pytest.mark.parametrize(
+    ("how", "file"),
+    [
+        *itertools.product(
+            ["cut", "longer", "changed", "gone"],
+            ["state/*.memmap", "state/meta.json", "state.json", "seal.json"],
+        ),
+        ("pickle", "state.json"),
+    ],
+)
 def test_a_damaged_file_is_named_and_left_as_it_is(run: Path, tmp_path: Path, how: str, file: str):
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
@@ -262,3 +271,13 @@ def test_a_damaged_file_is_named_and_left_as_it_is(run: Path, tmp_path: Path, ho
     with pytest.raises(ValueError, match=f"is damaged: {part.name}/.*{named}"):
         load_agent(run_config(copy), copy, "checkpoint")
     assert before == {p: p.read_bytes() for p in copy.rglob("*") if p.is_file()}
+
+
+def test_a_damaged_export_is_named(run: Path, tmp_path: Path):
+    folder = export(run, tmp_path / "policy")
+    archive = folder / EXPORTED
+    data = bytearray(archive.read_bytes())
+    data[len(data) // 2] ^= 1
+    archive.write_bytes(data)
+    with pytest.raises(ValueError, match="is damaged"):
+        load_agent(run_config(folder), folder, "checkpoint")

@@ -150,6 +150,9 @@ def test_the_file_of_a_run_is_checked_again_when_it_goes_on(tmp_path: Path, refu
         ("gamma", 2.0, "gamma must be >= 0 and <= 1, got 2.0"),
         ("seed", "one", "seed must be a whole number, got 'one'"),
         ("learning.tau", 3.0, "learning.tau must be >= 0 and <= 1, got 3.0"),
+        ("gamma", "0.9", "gamma must be a number, got '0.9'"),
+        ("record_every", "8", "record_every must be a whole number, got '8'"),
+        ("learning.tau", "0.1", "learning.tau must be a number, got '0.1'"),
         ("gama", 0.5, "gama"),
     ):
         edited = OmegaConf.create(OmegaConf.to_container(cfg, resolve=True))

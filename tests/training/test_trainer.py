@@ -104,6 +104,22 @@ def test_a_training_that_diverges_stops_and_keeps_its_last_good_checkpoint(algo,
     assert all(map(math.isfinite, terms))
 
 
+def test_nothing_that_is_not_finite_is_kept(tmp_path: Path):
+    """Buffers and sums, too: the checkpoint before stays the newest."""
+    trainer = trainer_of(tmp_path, "algo=rsac", "frames=1000")
+    trainer.save()
+    newest = trainer.checkpoint.rotation.latest()
+    trainer.progress.frames = 8
+    trainer._sums["loss_qvalue"] = torch.tensor(torch.nan)
+    with pytest.raises(ValueError, match="loss_qvalue is not finite at frame 8: .*checkpoint-0"):
+        trainer.save()
+    trainer._sums.clear()
+    trainer.learner.loss.lagrange.value.fill_(torch.inf)
+    with pytest.raises(ValueError, match="lagrange.value is not finite at frame 8: .*checkpoint-0"):
+        trainer.save()
+    assert trainer.checkpoint.rotation.latest() == newest
+
+
 @pytest.mark.parametrize(
     "task", [("task=gs",), ("task=gs", "env=highway"), ("task=gym", "task.id=Pendulum-v1")]
 )
