@@ -258,7 +258,7 @@ def test_loggers_open_when_training_starts(tmp_path: Path, refusal, monkeypatch)
     run.mkdir()
     OmegaConf.save(compose(*options), run / "config.yaml", resolve=True)
     assert "holds no checkpoint" in refusal("train", "config", "resume=run")
-    assert [path.name for path in run.iterdir()] == ["config.yaml"]
+    assert sorted(path.name for path in run.iterdir()) == [".lock", "config.yaml"]
 
     def missing(*args, **kwargs):
         raise ImportError("no tensorboard")

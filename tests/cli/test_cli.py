@@ -204,7 +204,7 @@ def test_train_from_any_folder_then_multirun(command, tmp_path: Path, capsys):
     command(*TRAIN, *SMALL, *EMPTY, "algo=sac", "out=mine", "logger=tensorboard")
     names = {path.name for path in (tmp_path / "mine").iterdir()}
     assert names == {
-        "checkpoints", "config.yaml", "evaluation", "metrics.csv", "tensorboard", "timing.csv",
+        ".lock", "checkpoints", "config.yaml", "evaluation", "metrics.csv", "tensorboard", "timing.csv",
     }  # fmt: skip
     assert {path.name for path in tmp_path.iterdir()} == {"mine"}
     assert "SR" in capsys.readouterr().out
