@@ -64,8 +64,6 @@ def _load(checkpoint: Checkpoint, path: Path) -> None:
     except (CheckpointError, OSError) as error:
         if isinstance(error.__cause__, Damaged):
             raise ValueError(f"checkpoint {path} is damaged: {error.__cause__}.") from error
-        if "target adapter" in str(error):
-            raise ValueError(f"checkpoint {path} was written by an older saferl.") from error
         raise ValueError(
             f"checkpoint {path} does not fit this configuration: {error.__cause__ or error} "
             f"Use the configuration that it was trained with ({CONFIG} in its run)."

@@ -298,9 +298,8 @@ class Trainer:
                 key: float(value) / max(self._count, 1) for key, value in sorted(self._sums.items())
             },
         }
-        for key in self._sums:
-            if not math.isfinite(row[key]):
-                raise self._diverged(key)
+        for name in _not_finite(self._sums):
+            raise self._diverged(name)
         for group in self.learner.optimizer.param_groups:
             row[f"lr_{group['name']}"] = group["lr"]
         self._sums, self._count = {}, 0

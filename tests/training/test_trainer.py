@@ -93,15 +93,15 @@ def test_demonstrations_fill_the_buffer_before_the_first_frame(tmp_path: Path):
 def test_a_training_that_diverges_stops_and_keeps_its_last_good_checkpoint(algo, tmp_path: Path):
     """By steps of a size that no network survives."""
     rates = [f"learning.lr.{name}=[1e30,1e30]" for name in ("actor", "critic")]
-    cfg = compose(*SMALL, *EMPTY, f"algo={algo}", "frames=400", "save_every=8", *rates)
+    fresh = algo in ("ppo_lag", "cpo")  # their first update follows their first batch
+    late = () if fresh else ("learning.warmup_frames=40",)
+    cfg = compose(*SMALL, *EMPTY, f"algo={algo}", "frames=400", "save_every=8", *rates, *late)
     with pytest.raises(ValueError, match=r"at frame \d+: the training diverged.*checkpoint-\d+;"):
         build_trainer(cfg, tmp_path).train()
     kept = build_trainer(cfg, tmp_path)
     kept.resume()
+    assert kept.progress.frames == (0 if fresh else 40)
     assert all(p.isfinite().all() for p in kept.learner.loss.parameters())
-    rows = kept.metrics.read()
-    terms = [value for row in rows for key, value in row.items() if key.startswith("loss")]
-    assert all(map(math.isfinite, terms))
 
 
 def test_nothing_that_is_not_finite_is_kept(tmp_path: Path):
