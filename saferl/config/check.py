@@ -97,7 +97,7 @@ def arguments(target: str) -> dict[str, Any] | None:
         ValueError: there is no such class or function.
     """
     try:
-        function = hydra.utils.get_object(target)
+        function: Any = hydra.utils.get_object(target)
     except Exception as error:
         raise ValueError(f"_target_ names nothing that can be imported: {target!r}.") from error
     kinds: dict[str, Any] = {}
