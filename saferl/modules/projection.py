@@ -52,8 +52,8 @@ class _Descent(NamedTuple):
 
 def _evaluate(risk_fn: Callable[[Tensor], Tensor], action: Tensor) -> tuple[Tensor, Tensor]:
     """Risk [*B] of each action and its gradient [*B, A]."""
-
-    def total(action: Tensor) -> tuple[Tensor, Tensor]:
+    with torch.enable_grad():
+        action = action.detach().requires_grad_()
         risk = risk_fn(action)
         if risk.shape == (*action.shape[:-1], 1):
             risk = risk.squeeze(-1)
@@ -63,10 +63,10 @@ def _evaluate(risk_fn: Callable[[Tensor], Tensor], action: Tensor) -> tuple[Tens
                 f"{(*action.shape[:-1], 1)} for actions of shape {tuple(action.shape)}, got "
                 f"{tuple(risk.shape)}."
             )
-        return risk.sum(), risk
-
-    slope, risk = torch.func.grad(total, has_aux=True)(action)
-    return risk, slope
+        if not risk.requires_grad:  # no action changes it
+            return risk, torch.zeros_like(action)
+        (slope,) = torch.autograd.grad(risk.sum(), action, materialize_grads=True)
+    return risk.detach(), slope
 
 
 def _descend(
@@ -88,7 +88,7 @@ def _descend(
         gradient = torch.where(outward, 0.0, gradient)
         norm = gradient.abs().amax(-1)
         # A gradient that is not finite cannot say where to go: the sample stops like at g = 0.
-        active = at.active & (norm > 0) & norm.isfinite()
+        active = at.active & (norm > 0) & (norm < torch.inf)
         scale = torch.where(active, step_size / norm, 0.0).unsqueeze(-1)
         moved = (at.action - scale * gradient).clamp(low, high)  # pyright: ignore
         action = torch.where(active.unsqueeze(-1), moved, at.action)
@@ -149,7 +149,7 @@ def project(
 
     Args:
         risk_fn: maps actions [*B, A] to risks [*B] or [*B, 1], each sample for itself. It must be
-            differentiable by ``torch.func.grad``; its parameters receive no gradient.
+            differentiable by autograd; its parameters receive no gradient.
         action: a_init [*B, A], in the units of ``low`` and ``high``.
         limit: d_thres, the largest allowed risk.
         steps: N_iter, the largest number of steps.
