@@ -5,13 +5,17 @@ But for ``_AcceptedKeys``, which TorchRL asks every loss to define.
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import SACLoss
+
+from saferl.objectives.checks import check_gamma
 
 if TYPE_CHECKING:
     from torchrl.objectives import LossModule as _Loss
@@ -23,18 +27,40 @@ class LossMixin(_Loss):
     """What a loss of ours adds to one of TorchRL's; comes before it among the bases of a class.
 
     It is no :class:`~torchrl.objectives.LossModule` itself: TorchRL gives every subclass of that a ``forward``, which
-    would hide the loss's from ``super()``. A subclass says which entries it reads (:meth:`read_keys`) and names them
-    to the estimators that it adds (:meth:`name_keys`); :meth:`reduced` reduces its terms.
+    would hide the loss's from ``super()``. A subclass says which entries it reads (:meth:`read_keys`), and what a second
+    value estimator, of the cost, calls them (:meth:`cost_estimator_keys`); :meth:`reduced` reduces its terms.
     """
 
     tensor_keys: Any  # of the loss, with the keys of ours
+    cost_critic: TensorDictModule
+    _cost_value_estimator: Any
 
     def read_keys(self) -> list[NestedKey]:
         """The entries that ``forward`` reads, as ``in_keys`` lists them."""
         raise NotImplementedError
 
-    def name_keys(self) -> None:
-        """Tell the estimators of ours what the entries are called; nothing where there is none yet."""
+    def cost_estimator_keys(self) -> dict[str, NestedKey]:
+        """The entries of the cost's estimator, by its own names for them."""
+        raise NotImplementedError
+
+    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
+        """Build the value estimators of the reward and of the cost, alike.
+
+        Args:
+            value_type (ValueEstimators, ValueEstimatorBase or type, optional): as in
+                TorchRL's losses, with the same default.
+            **hyperparams: of the estimator, such as ``gamma``.
+
+        Raises:
+            ValueError: ``gamma`` lies outside [0, 1].
+        """
+        check_gamma(hyperparams)
+        super().make_value_estimator(value_type, **hyperparams)
+        self._cost_value_estimator = deepcopy(self.value_estimator)
+        if self.value_estimator.value_network is not None:
+            # The copy shares the functional network's structure only; whose values it takes is said here.
+            self._cost_value_estimator.value_network = self.cost_critic
+        self.set_keys()  # no other ones: both estimators are told
 
     def reduced(
         self,
@@ -73,7 +99,9 @@ class LossMixin(_Loss):
 
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
         super()._forward_value_estimator_keys(**kwargs)
-        self.name_keys()
+        estimator = getattr(self, "_cost_value_estimator", None)
+        if estimator is not None:
+            estimator.set_keys(**self.cost_estimator_keys())
 
 
 class SACTerms(SACLoss):

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from copy import deepcopy
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase, TensorDictParams
@@ -15,7 +14,7 @@ from torchrl.objectives import PPOLoss
 from torchrl.objectives.utils import distance_loss
 
 from saferl.objectives.adapter import LossMixin
-from saferl.objectives.checks import check_begun, check_cost, check_gamma
+from saferl.objectives.checks import check_begun, check_cost
 
 
 @dataclass
@@ -67,7 +66,6 @@ class CostValueMixin(LossMixin):
     critic_network: TensorDictModule
     critic_network_params: TensorDictParams
     target_critic_network_params: TensorDictParams
-    _cost_value_estimator: Any
 
     def add_cost_value(self, cost_critic: TensorDictModule) -> None:
         """Take the cost critic in, and make the estimators, by the names that the two values have."""
@@ -79,35 +77,16 @@ class CostValueMixin(LossMixin):
         # Asked for now, so that a fresh loss loads a state_dict strictly.
         _ = self.value_estimator
 
-    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
-        """Build the advantage estimators of the reward and of the cost, alike.
-
-        Args:
-            value_type (optional): as in TorchRL's losses. Defaults to GAE.
-            **hyperparams: of the estimator, such as ``gamma`` and ``lmbda``.
-
-        Raises:
-            ValueError: ``gamma`` lies outside [0, 1].
-        """
-        check_gamma(hyperparams)
-        super().make_value_estimator(value_type, **hyperparams)
-        self._cost_value_estimator = deepcopy(self.value_estimator)
-        # The copy shares the functional network's structure only; whose values it takes is said here.
-        self._cost_value_estimator.value_network = self.cost_critic
-        self.set_keys()  # no other ones: both estimators are told
-
-    def name_keys(self) -> None:
-        estimator = getattr(self, "_cost_value_estimator", None)
-        if estimator is not None:
-            keys = self.tensor_keys
-            estimator.set_keys(
-                advantage=keys.cost_advantage,
-                value_target=keys.cost_value_target,
-                value=keys.state_cost_value,
-                reward=keys.cost,
-                done=keys.done,
-                terminated=keys.done,
-            )
+    def cost_estimator_keys(self) -> dict[str, NestedKey]:
+        keys = self.tensor_keys
+        return {
+            "advantage": keys.cost_advantage,
+            "value_target": keys.cost_value_target,
+            "value": keys.state_cost_value,
+            "reward": keys.cost,
+            "done": keys.done,
+            "terminated": keys.done,
+        }
 
     def read_keys(self) -> list[NestedKey]:
         # The other base asks before the cost critic is there.

@@ -6,9 +6,8 @@ E13 is equation (11) of the paper, `arXiv 2503.19690 <https://arxiv.org/abs/2503
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import deepcopy
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from tensordict import TensorDictBase, TensorDictParams, unravel_key
@@ -24,7 +23,6 @@ from saferl.objectives.adapter import LossMixin
 from saferl.objectives.checks import (
     check_choice,
     check_cost,
-    check_gamma,
     check_lagrange,
     check_limit,
     count_members,
@@ -108,7 +106,6 @@ class CostCriticMixin(LossMixin):
     actor_network: TensorDictModule
     qvalue_network: TensorDictModule
     deactivate_vmap: bool
-    _cost_value_estimator: Any
     _shared: SharedTerms | None = None
 
     def add_cost_critic(
@@ -148,32 +145,14 @@ class CostCriticMixin(LossMixin):
         # Asked for now, so that a fresh loss loads a state_dict strictly.
         _ = self.value_estimator
 
-    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
-        """Build the value estimators of the reward and of the cost, alike.
-
-        Args:
-            value_type (ValueEstimators, ValueEstimatorBase or type, optional): as in
-                TorchRL's losses. Defaults to TD(0).
-            **hyperparams: of the estimator, such as ``gamma``.
-
-        Raises:
-            ValueError: ``gamma`` lies outside [0, 1].
-        """
-        check_gamma(hyperparams)
-        super().make_value_estimator(value_type, **hyperparams)
-        self._cost_value_estimator = deepcopy(self.value_estimator)
-        self.set_keys()  # no other ones: both estimators are told
-
-    def name_keys(self) -> None:
-        estimator = getattr(self, "_cost_value_estimator", None)
-        if estimator is not None:
-            keys = self.tensor_keys
-            estimator.set_keys(
-                value=keys.state_action_cost_value,
-                reward=keys.cost,
-                done=keys.done,
-                terminated=keys.terminated,
-            )
+    def cost_estimator_keys(self) -> dict[str, NestedKey]:
+        keys = self.tensor_keys
+        return {
+            "value": keys.state_action_cost_value,
+            "reward": keys.cost,
+            "done": keys.done,
+            "terminated": keys.terminated,
+        }
 
     @property
     def observation_keys(self) -> list[NestedKey]:
