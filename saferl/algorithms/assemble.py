@@ -161,8 +161,10 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
     torch.set_num_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
     algorithm, parts = algorithm_of(cfg.learning), Parts.of(cfg)
+    num_envs = cfg.env.num_envs
     check_task(cfg.evaluation, parts.task)
-    agent, num_envs = algorithm.agent(parts), cfg.env.num_envs
+    algorithm.check_collecting(parts.task, num_envs)
+    agent = algorithm.agent(parts)
     if cfg.init and not (run / FOLDER).exists():  # a run that goes on has its own networks
         begin_from(agent, algorithm.architecture(parts), Path(cfg.init), cfg.device)
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])

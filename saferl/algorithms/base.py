@@ -95,9 +95,6 @@ class Algorithm(ABC):
             build_env: makes more environments from their number and a seed.
             num_envs: environments at once.
             seed: of the mini-batches.
-
-        Raises:
-            ValueError: what is configured cannot be learned from.
         """
 
     @abstractmethod
@@ -115,6 +112,14 @@ class Algorithm(ABC):
     def random_frames(self) -> int:
         """Frames of random actions at the start of a new policy."""
         return 0
+
+    @abstractmethod
+    def check_collecting(self, task: Task, num_envs: int) -> None:
+        """Refuse settings that do not fit what is collected, before anything is built.
+
+        Raises:
+            ValueError: names them, and what they must be.
+        """
 
     def check(self, parts: Parts) -> None:
         """Refuse parts that do not go together.

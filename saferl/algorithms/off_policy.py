@@ -67,15 +67,7 @@ class OffPolicy(OffPolicyLearning, Algorithm):
     def random_frames(self) -> int:
         return self.warmup_frames
 
-    def experience(
-        self,
-        agent: Agent,
-        learner: Learner,
-        task: Task,
-        build_env: Callable[[int, int], EnvBase],
-        num_envs: int,
-        seed: int,
-    ) -> Replay:
+    def check_collecting(self, task: Task, num_envs: int) -> None:
         if self.demonstrations and not task.demonstrators:
             raise ValueError(
                 f"learning.demonstrations are of scripted drivers, which task={task.task} has not: "
@@ -87,6 +79,16 @@ class OffPolicy(OffPolicyLearning, Algorithm):
                 f"learning.buffer_size must be >= env.num_envs * learning.frames_per_env, got {self.buffer_size} "
                 f"and {collected}."
             )
+
+    def experience(
+        self,
+        agent: Agent,
+        learner: Learner,
+        task: Task,
+        build_env: Callable[[int, int], EnvBase],
+        num_envs: int,
+        seed: int,
+    ) -> Replay:
         device = next(agent.loss.parameters()).device
         generator = torch.Generator(device).manual_seed(seed)
         buffer = TensorDictReplayBuffer(

@@ -82,6 +82,14 @@ class OnPolicy(OnPolicyLearning, Algorithm):
     def transforms(self) -> list[Transform]:
         return [InitTracker()]
 
+    def check_collecting(self, task: Task, num_envs: int) -> None:
+        frames = self.decisions(num_envs) * num_envs
+        if self.batch_size > frames:
+            raise ValueError(
+                f"learning.batch_size must be <= {frames}, the frames of a batch from one policy "
+                f"(learning.rollout_frames), got {self.batch_size}."
+            )
+
     def experience(
         self,
         agent: Agent,
@@ -92,11 +100,6 @@ class OnPolicy(OnPolicyLearning, Algorithm):
         seed: int,
     ) -> Epochs:
         frames = self.decisions(num_envs) * num_envs
-        if self.batch_size > frames:
-            raise ValueError(
-                f"learning.batch_size must be <= {frames}, the frames of a batch from one policy "
-                f"(learning.rollout_frames), got {self.batch_size}."
-            )
         device = next(agent.loss.parameters()).device
         generator = torch.Generator(device).manual_seed(seed)
         buffer = TensorDictReplayBuffer(

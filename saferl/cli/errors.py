@@ -50,6 +50,11 @@ def explain(error: Exception, config: str = "config", arguments: list[str] | Non
         return "a group takes the name of a choice; --help lists the groups and their choices."
     if found := re.search(r"^In '(.*?)': .*?Key '(.*?)' not in .*? full_key: (\S+)", message):
         return f"unknown key {found[3]} in {found[1]}; {_hint(found[2], _beside(found[3], config))}"
+    # Of a run's own file, which somebody has edited.
+    if found := re.match(r"Key '(.*?)' not in '.*?' full_key: (\S+)", message):
+        return f"unknown key {found[2]}; {_hint(found[1], _beside(found[2], config))}"
+    if found := re.match(r"Missing (?:mandatory value:|key) .*? full_key: (\S+)", message):
+        return f"{found[1]} is missing."
     if isinstance(error, HydraException):
         return message.partition(" See https")[0]
     return message

@@ -11,7 +11,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import hydra
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
 
 from saferl.config import schema
 from saferl.envs.task import Task
@@ -78,6 +78,9 @@ def check_targets(node: Any, path: str = "", kind: Any = None) -> None:
     accepted = None if target is None else arguments(target)
     if target is None and is_dataclass(kind):
         target, accepted = f"{path}, a {kind.__name__},", get_type_hints(kind)  # pyright: ignore
+    for key in _required(node.get("_target_")):
+        if key not in node:
+            raise ValueError(f"{path}.{key} is missing: {target} has no default for it.")
     for key, value in node.items():
         name = f"{path}.{key}".removeprefix(".")
         if accepted is not None and not str(key).startswith("_"):
@@ -88,6 +91,14 @@ def check_targets(node: Any, path: str = "", kind: Any = None) -> None:
             if not isinstance(value, DictConfig) and not fits(value, accepted[key]):
                 raise ValueError(f"{name} must be {describe(accepted[key])}, got {value!r}.")
         check_targets(value, name, (accepted or {}).get(str(key)))
+
+
+def _required(target: str | None) -> list[str]:
+    """The settings that a dataclass named by a ``_target_`` leaves to the configuration."""
+    kind = None if target is None else hydra.utils.get_object(target)
+    if not is_dataclass(kind):
+        return []
+    return [field.name for field in fields(kind) if field.default == MISSING]
 
 
 def arguments(target: str) -> dict[str, Any] | None:

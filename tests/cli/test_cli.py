@@ -153,10 +153,17 @@ def test_the_file_of_a_run_is_checked_again_when_it_goes_on(tmp_path: Path, refu
         ("gamma", "0.9", "gamma must be a number, got '0.9'"),
         ("record_every", "8", "record_every must be a whole number, got '8'"),
         ("learning.tau", "0.1", "learning.tau must be a number, got '0.1'"),
-        ("gama", 0.5, "gama"),
+        ("gama", 0.5, "unknown key gama; did you mean gamma?"),
+        ("learning.tua", 0.5, "unknown key learning.tua"),
+        ("gamma", None, "gamma is missing"),
+        ("learning.tau", None, "learning.tau is missing"),
+        ("encoder._target_", None, "encoder._target_ is missing"),
     ):
         edited = OmegaConf.create(OmegaConf.to_container(cfg, resolve=True))
         OmegaConf.update(edited, key, value)
+        if value is None:
+            parent, _, name = f".{key}".rpartition(".")
+            (OmegaConf.select(edited, parent.strip(".")) if parent else edited).pop(name)
         OmegaConf.save(edited, run / CONFIG)
         assert words in refusal(*TRAIN, f"resume={run}")
 
