@@ -19,6 +19,7 @@ from saferl.algorithms.parts import Parts
 from saferl.config.schema import OnPolicyLearning
 from saferl.envs.task import Task
 from saferl.modules import StateValue, value_operator
+from saferl.objectives.advantages import score_actions
 from saferl.training.experience import Epochs
 from saferl.training.learner import Learner
 
@@ -121,10 +122,12 @@ class OnPolicy(OnPolicyLearning, Algorithm):
 
 def before_updates(loss: Any) -> list[Callable[[TensorDictBase], Any]]:
     """What an on-policy loss does with a whole batch: its advantages, and the step of its policy if it has one."""
-    # TorchRL's own losses leave their advantages to their estimator.
-    begin = getattr(loss, "begin", None) or partial(
-        loss.value_estimator,
-        params=loss.critic_network_params.detach(),
-        target_params=loss.target_critic_network_params,
-    )
-    return [begin, loss.policy_step().step] if hasattr(loss, "policy_step") else [begin]
+    if not hasattr(loss, "begin"):  # TorchRL's own losses leave their advantages to their estimator
+        estimate = partial(
+            loss.value_estimator,
+            params=loss.critic_network_params.detach(),
+            target_params=loss.target_critic_network_params,
+        )
+        return [partial(score_actions, loss), estimate]
+    step = [loss.policy_step().step] if hasattr(loss, "policy_step") else []
+    return [loss.begin, *step]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase, TensorDictParams
@@ -36,6 +36,29 @@ class CostValueKeys(PPOLoss._AcceptedKeys):
 def written(network: TensorDictModule, key: NestedKey) -> NestedKey:
     """What a network calls its value: ``key``, or else the first of its entries."""
     return key if key in network.out_keys else network.out_keys[0]
+
+
+@torch.no_grad()
+def score_actions(loss: Any, tensordict: TensorDictBase) -> None:
+    """Write the log-probability of each action as it is kept, by the very distribution that drew it.
+
+    TorchRL scores a fresh action by the number before its tanh. Near the end of the box float32 rounds the action, and no
+    loss finds that number again: the ratio of an unchanged policy would not be 1.
+
+    Args:
+        loss: an on-policy loss, whose actor drew the actions.
+        tensordict: ``[*B]``, fresh from the actor.
+
+    Reads ``"action"`` ``[*B, A]`` and the parameters of its distribution, as the actor wrote them (``"loc"`` and
+        ``"scale"`` ``[*B, A]``). A batch without them stays as it is.
+    Writes ``"action_log_prob"`` ``[*B]``.
+    """
+    actor, keys = loss.actor_network, loss.tensor_keys
+    parameters = actor[-1].in_keys
+    if all(tensordict.get(key, None) is not None for key in parameters):
+        action = tensordict.get(keys.action)
+        log_prob = actor.build_dist_from_params(tensordict).log_prob(action)
+        tensordict.set(keys.sample_log_prob, log_prob)
 
 
 class CostValueMixin(LossMixin):
@@ -99,6 +122,8 @@ class CostValueMixin(LossMixin):
     def begin(self, tensordict: TensorDictBase) -> None:
         """Write the advantages and value targets of a batch of fresh transitions, before it is cut into mini-batches.
 
+        The actions' log-probabilities are written anew, see :func:`score_actions`.
+
         Args:
             tensordict: ``[*B, T]``.
 
@@ -111,6 +136,7 @@ class CostValueMixin(LossMixin):
             KeyError: the batch holds no cost.
         """
         check_cost(tensordict, self.tensor_keys.cost)
+        score_actions(self, tensordict)
         for estimator, params, target_params in (
             (
                 self.value_estimator,

@@ -7,6 +7,7 @@ import torch
 from on_policy import GAMMA, LAMBDA, LOSSES, batch_of, build, value
 from torchrl.objectives import ClipPPOLoss, ValueEstimators
 
+from saferl.algorithms.on_policy import before_updates
 from saferl.modules import DualAscent
 
 
@@ -81,6 +82,28 @@ def test_without_a_multiplier_it_is_torchrls_own():
     ours, other = loss(data.reshape(-1)), theirs(data.reshape(-1))
     for key in ("loss_objective", "loss_critic", "kl_approx"):
         torch.testing.assert_close(ours[key], other[key])
+
+
+@pytest.mark.parametrize("kind", [*LOSSES, "torchrl"])
+@pytest.mark.parametrize("location", [0.0, 9.0, 20.0])
+def test_an_unchanged_policy_has_a_ratio_of_one(kind: str, location: float):
+    """Also where tanh saturates, and the number before it cannot be found again."""
+    loss, actor = build("ppo_lag" if kind == "torchrl" else kind)
+    actor = actor.float()  # float64 keeps apart what float32 rounds to the end of the box
+    with torch.no_grad():
+        actor[0].module.head.weight.zero_()
+        actor[0].module.head.bias.copy_(torch.tensor([location, -location, -3.0, -3.0]))
+    if kind == "torchrl":
+        loss = ClipPPOLoss(actor, value("state_value"))
+        loss.make_value_estimator(ValueEstimators.GAE, gamma=GAMMA, lmbda=LAMBDA)
+    data = batch_of(actor.double()).apply(lambda x: x.float() if x.is_floating_point() else x)
+    data = actor.float()(data)
+    drawn = data["action_log_prob"]
+    for hook in before_updates(loss.float())[:1]:  # not CPO's step, which changes the policy
+        hook(data)
+    found = actor.get_dist(data).log_prob(data["action"])
+    torch.testing.assert_close(data["action_log_prob"], found, rtol=1e-5, atol=1e-4)
+    assert torch.allclose(drawn, found, atol=1e-2) == (location == 0.0)
 
 
 @pytest.mark.parametrize("kind", LOSSES)
