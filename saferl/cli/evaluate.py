@@ -13,6 +13,7 @@ from typing import Any
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.transforms import Transform
@@ -60,6 +61,8 @@ def evaluate(cfg: DictConfig) -> None:
     title = f"{name.partition(' ')[0]}-{task.task}-seed{cfg.seed}"
     folder = f"evaluation/{title}/{datetime.now():%Y-%m-%d_%H-%M-%S-%f}"
     out = Path(folder if cfg.out is None else str(cfg.out))
+    if HydraConfig.get().mode is RunMode.MULTIRUN:  # one folder a job
+        out = Path(HydraConfig.get().runtime.output_dir)
     if (out / "metrics.json").exists():
         raise ValueError(f"out: {out} holds a test already; take another folder.")
     rows = measure(

@@ -5,18 +5,21 @@ from __future__ import annotations
 import importlib
 import os
 import sys
+import traceback
 from contextlib import suppress
 from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig
 
+from saferl.cli.arguments import PATHS, readable
 from saferl.cli.errors import MISTAKES, explain
 from saferl.config import schema
 from saferl.config.locate import config_dir
+from saferl.evaluation.compare import FAILED, Summary
 
-PATHS = ("out", "checkpoint", "resume", "init")
 INTERRUPTED = 130
 
 
@@ -24,8 +27,10 @@ def launch(command: str, config: str) -> None:
     """Run the command ``saferl.cli.COMMAND`` on the configuration that ``sys.argv`` describes.
 
     Exits with 0, with 1 after one line about a mistake, or with 130 after Ctrl-C.
-    ``HYDRA_FULL_ERROR=1`` shows the trace instead of the line.
+    ``HYDRA_FULL_ERROR=1`` shows the trace instead of the line. Of several jobs (``-m``) each runs, whatever becomes of the
+    others; what went wrong stands in the job's folder, and the exit status is 1.
     """
+    sys.argv[1:] = readable(sys.argv[1:])
     # Threads of GNU's OpenMP that wait awake without end take the cores from another run's.
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", "1000")
@@ -42,10 +47,18 @@ def launch(command: str, config: str) -> None:
             # Late: help and most mistakes need no torch.
             getattr(importlib.import_module(f"saferl.cli.{command}"), command)(cfg)
         except BaseException as error:
-            _drop_if_empty(Path(HydraConfig.get().runtime.output_dir))
+            folder = Path(HydraConfig.get().runtime.output_dir)
+            if HydraConfig.get().mode is RunMode.MULTIRUN and isinstance(error, Exception):
+                line = explain(error) if isinstance(error, MISTAKES) else traceback.format_exc()
+                print(f"error: {line}", file=sys.stderr)
+                (folder / FAILED).write_text(f"{line}\n", encoding="utf-8")
+                return
+            _drop_if_empty(folder)
             if isinstance(error, MISTAKES) and before != "1":
                 raise SystemExit(f"error: {explain(error)}") from None
             raise
+        else:
+            (Path(HydraConfig.get().runtime.output_dir) / FAILED).unlink(missing_ok=True)
 
     try:
         hydra.main(version_base="1.3", config_path=config_dir(), config_name=config)(run)()
@@ -62,6 +75,10 @@ def launch(command: str, config: str) -> None:
         del os.environ["HYDRA_FULL_ERROR"]
         if before is not None:
             os.environ["HYDRA_FULL_ERROR"] = before
+    if Summary.failed:
+        raise SystemExit(
+            f"error: {', '.join(Summary.failed)} failed; each says why in its {FAILED}."
+        )
 
 
 def _drop_if_empty(folder: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.transforms import Transform
@@ -16,7 +17,7 @@ from saferl.algorithms.assemble import build_trainer, complete
 from saferl.checkpoint.lock import alone
 from saferl.checkpoint.run import CONFIG, FOLDER, run_config, run_folder
 from saferl.cli.evaluate import compiling, measure, pictures, trained_policy
-from saferl.evaluation.compare import side_by_side
+from saferl.evaluation.compare import TESTED, side_by_side
 from saferl.evaluation.statistics import FIGURES, summarise
 
 log = logging.getLogger(__name__)
@@ -29,7 +30,13 @@ def train(cfg: DictConfig) -> None:
         run = Path(HydraConfig.get().runtime.output_dir)
         complete(cfg.task)
         OmegaConf.resolve(cfg)
-        claim(run, cfg)
+        if HydraConfig.get().mode is RunMode.MULTIRUN and begun(run, cfg):
+            if (run / TESTED).exists():
+                log.info("%s is there already.", run)
+                return
+            resuming = True
+        else:
+            claim(run, cfg)
     else:
         others = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]
         if others:
@@ -97,6 +104,12 @@ def closing_test(cfg: DictConfig, run: Path) -> None:
     pictures(
         cfg.env, task, policy, transforms, results[cfg.algo_name][: settings.gif], out, cfg.device
     )
+
+
+def begun(run: Path, cfg: DictConfig) -> bool:
+    """Whether a folder holds a checkpoint of this very configuration."""
+    there = (run / FOLDER).exists() and (run / CONFIG).exists()
+    return there and run_config(run) == cfg
 
 
 def claim(run: Path, cfg: DictConfig) -> None:

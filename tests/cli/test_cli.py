@@ -218,9 +218,11 @@ def test_train_from_any_folder_then_multirun(command, tmp_path: Path, capsys):
 
     command(*TRAIN, "-m", *SMALL, *EMPTY, "algo=sac,asac", "seed=0,1", "frames=8", "out=many")
     jobs = sorted(path for path in (tmp_path / "many").iterdir() if path.is_dir())
-    assert [job.name for job in jobs] == ["0", "1", "2", "3"]
+    assert [job.name for job in jobs] == [
+        f"algo-{algo}_seed-{seed}" for algo in ("asac", "sac") for seed in (0, 1)
+    ]
     made = [(job / CONFIG).read_text() for job in jobs]
-    assert ["algo_name: sac\n" in text for text in made] == [True, True, False, False]
+    assert ["algo_name: sac\n" in text for text in made] == [False, False, True, True]
     assert [f"seed: {seed}\n" in text for seed, text in zip((0, 1, 0, 1), made, strict=True)] == [
         True
     ] * 4
@@ -233,6 +235,56 @@ def test_train_from_any_folder_then_multirun(command, tmp_path: Path, capsys):
     assert summary[0].split() == ["runs", "SR", "%", "CR", "%", "return", "cost", "return"]
     for line, algo in zip(summary[1:], ("sac", "asac"), strict=True):
         assert re.match(algo + r" gs +2 +\S+ \[\S+, \S+\]  ", line)
+
+
+def test_one_refused_job_of_a_sweep_stops_no_other(command, tmp_path: Path, capsys):
+    """It is told at the end and by its folder; the same command again does what is missing, and only that."""
+    small = [setting for setting in SMALL if "batch_size" not in setting]
+    many = (*TRAIN, *small, "task=cart", "algo=sac", "seed=0,1", "out=many", "-m")
+    with pytest.raises(SystemExit) as left:
+        command(*many, "learning.batch_size=8,100000")
+    bad = [f"many/learning.batch_size-100000_seed-{seed}" for seed in (0, 1)]
+    good = [tmp_path / name.replace("100000", "8") for name in bad]
+    assert str(left.value).startswith(f"error: {bad[0]}, {bad[1]} failed")
+    assert "got 64 and 100000" in (tmp_path / bad[0] / "error.txt").read_text()
+    assert re.search(r"sac cart +2 ", capsys.readouterr().out)
+
+    rows = [(run / "metrics.csv").read_text() for run in good]
+    (good[1] / "evaluation/metrics.json").unlink()
+    with pytest.raises(SystemExit) as left:
+        command(*many, "learning.batch_size=8,100000,200000")
+    assert str(left.value).count("00000_seed") == 4
+    assert re.search(r"sac cart +2 ", out := capsys.readouterr().out)
+    assert f"{good[0]} is there already" in out and f"{good[1]} is there already" not in out
+    assert rows == [(run / "metrics.csv").read_text() for run in good]
+    command(*many, "learning.batch_size=8,16")
+    assert capsys.readouterr().out.count("sac cart learning.batch_size=") == 2
+    assert not list(tmp_path.glob("many/*/error.txt"))
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "Läufe",
+        "run (1)",
+        "algo=rsac,seed=0",
+        "50%",
+        "a{b}",
+        "it's",
+        "ends\\",
+        "007",
+        "true",
+        "a b#c",
+    ],
+)
+def test_a_path_may_hold_any_character(name: str, command, tmp_path: Path):
+    command(*TRAIN, *SMALL, "task=cart", "algo=sac", "frames=8", f"out={name}")
+    assert (tmp_path / name / "metrics.csv").is_file()
+    command(*TRAIN, f"resume={name}")
+    command(*TEST, f"checkpoint={name}", "episodes=1", f"out={name}/test")
+    command(*TEST, "-m", f"checkpoint={name}", "episodes=1", f"out={name}/tests", "seed=0,1")
+    made = sorted(path.parent.name for path in (tmp_path / name / "tests").glob("*/metrics.json"))
+    assert made == ["seed-0", "seed-1"]
 
 
 def test_run_folder_has_a_name_that_shells_like(command, tmp_path: Path):
