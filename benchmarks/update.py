@@ -15,7 +15,8 @@ batch. The sides take turns in one process:
   that has it (``benchmarks/omnisafe_sac_lag.py`` says how to make one); with the default width, batch and thread
   alone. It has one cost critic where ours has two.
 
-GFLOP are those of one eager update as torch counts them; the share is of the rate of a product of two
+Calls are the operators of an eager update, backward included. A compiled row shows how many graphs torch made for it, each of them whole
+(``fullgraph``, so that it cannot fall back to single operators). GFLOP are those of one eager update as torch counts them; the share is of the rate of a product of two
 1,024 x 1,024 matrices, measured in the same rounds. The matrix products of SAC-Lag's update are also timed
 alone: no arrangement of the same arithmetic is faster than they are.
 """
@@ -31,6 +32,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from side_by_side import alternate, conditions, medians, parser, transitions, write
 from straight import StraightSACLag
+from torch._dynamo.utils import counters
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import flop_registry
 
@@ -49,10 +51,11 @@ class Flops(TorchDispatchMode):
 
     def __init__(self):
         super().__init__()
-        self.total, self.products = 0, []
+        self.total, self.calls, self.products = 0, 0, []
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         out = func(*args, **(kwargs or {}))
+        self.calls += 1
         if (count := flop_registry.get(func._overloadpacket)) is not None:
             self.total += count(*args, **(kwargs or {}), out_val=out)
             self.products.append((func, args, kwargs or {}))
@@ -92,24 +95,31 @@ def main() -> None:
 
     sides: dict[str, Callable[[], int]] = {}
     flops: dict[str, float] = {}
+    calls: dict[str, int | str] = {}
     products: dict[str, Callable[[], int]] = {}
 
     def add(name: str, update: Callable, batch, same_as: str | None = None) -> None:
         """A side, warmed up; compiled ones have the arithmetic of the eager one."""
 
         def work() -> int:
-            update(batch)
+            update(batch.copy())  # losses write into a batch, and the next one is fresh
             return 1
 
         if same_as is None:
             with Flops() as counter:
                 work()
-            flops[name] = counter.total / 1e9
+            flops[name], calls[name] = counter.total / 1e9, counter.calls
             products[name] = counter.again
         else:
             flops[name] = flops[same_as]
+        before = counters["stats"]["unique_graphs"]
         for _ in range(3):
             work()
+        made = counters["stats"]["unique_graphs"] - before
+        if same_as is not None:
+            if not made:
+                raise SystemExit(f"{name} is not compiled.")
+            calls[name] = f"{made} graph{'s' * (made > 1)}"
         sides[name] = work
 
     def ours(name: str, overrides: list[str]) -> None:
@@ -154,7 +164,7 @@ def main() -> None:
     peak = speed["gemm"] * flops["gemm"]
     print(f"{conditions(options)}, batch {options.batch}, width {width}")
     print(f"GEMM rate {peak:.0f} GFLOP/s")
-    print(f"{'':28s}{'updates/s':>10s}{'GFLOP':>8s}{'of GEMM':>9s}")
+    print(f"{'':28s}{'updates/s':>10s}{'calls':>10s}{'GFLOP':>8s}{'of GEMM':>9s}")
     for name in speed:
         if name != "gemm":
             work = (
@@ -162,7 +172,7 @@ def main() -> None:
                 if name in flops
                 else ""
             )
-            print(f"{name:28s}{speed[name]:10.1f}{work}")
+            print(f"{name:28s}{speed[name]:10.1f}{calls.get(name, ''):>10}{work}")
 
     def ratio(left: str, right: str) -> float:
         print(f"{left} / {right}: {speed[left] / speed[right]:.2f}")
@@ -184,6 +194,7 @@ def main() -> None:
         },
         "updates_per_second": speed,
         "gflop": flops,
+        "calls": calls,
         "rounds": rates,
         "conditions": conditions(options),
     }
