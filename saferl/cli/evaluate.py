@@ -6,6 +6,7 @@ import json
 import logging
 import statistics
 from collections.abc import Sequence
+from contextlib import closing
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -45,9 +46,9 @@ def pictures(
     """An animation and a figure of each of these episodes of a test."""
     if not rows:
         return
-    alone = build_env(env, task, 1, 0, device_of(device), transforms)
-    for row in rows:
-        log.info("%s", task.draw(policy, alone, row, out))
+    with closing(build_env(env, task, 1, 0, device_of(device), transforms)) as alone:
+        for row in rows:
+            log.info("%s", task.draw(policy, alone, row, out))
 
 
 def evaluate(cfg: DictConfig) -> None:
@@ -204,8 +205,8 @@ def measure(
 ) -> list[dict]:
     """Play, write ``metrics.json`` (with what ``about`` says) and ``episodes.csv``, report the table; returns the rows."""
     at_once = envs_at_once(episodes, num_envs)
-    several = build_env(env, task, at_once, seed, device_of(device), transforms)
-    rows = play_episodes(policy, several, episodes, seed)
+    with closing(build_env(env, task, at_once, seed, device_of(device), transforms)) as several:
+        rows = play_episodes(policy, several, episodes, seed)
     latencies: list[float] = []
     for transform in transforms:  # free for another environment
         transform.reset_parent()

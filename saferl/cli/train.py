@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 import hydra
@@ -48,11 +49,13 @@ def train(cfg: DictConfig) -> None:
         cfg = run_config(run)
     with alone(run, "resume" if resuming else "out"):
         try:
-            trainer = build_trainer(cfg, run)
-            if resuming:
-                trainer.resume()
-            log.info("%s on %s, seed %d. Files: %s", cfg.algo_name, cfg.task.task, cfg.seed, run)
-            trainer.train()
+            with closing(build_trainer(cfg, run)) as trainer:
+                if resuming:
+                    trainer.resume()
+                log.info(
+                    "%s on %s, seed %d. Files: %s", cfg.algo_name, cfg.task.task, cfg.seed, run
+                )
+                trainer.train()
         finally:
             if not resuming and not (run / FOLDER).exists():  # it never began
                 (run / CONFIG).unlink(missing_ok=True)

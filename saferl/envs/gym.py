@@ -5,7 +5,9 @@
 from __future__ import annotations
 
 import importlib
+import traceback
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
@@ -73,7 +75,7 @@ class GymTask(Task):
             raise ValueError(
                 f"task.id: {self.id} must have actions in a bounded box [A] of floats, got {space}."
             )
-        return env
+        return _Placed(env, self.id)
 
     def complete(self) -> Mapping[str, int]:
         """What is left open of ``size``, ``action_dim`` and ``horizon``, from the environment itself, of
@@ -87,14 +89,14 @@ class GymTask(Task):
         horizon = limit if self.horizon is None else self.horizon
         if horizon is None:
             raise ValueError(f"task.horizon must be given: {self.id} has no time limit of its own.")
-        found = {
+        found: dict[str, int] = {
             "size": gymnasium.spaces.flatdim(env.observation_space),
             "action_dim": env.action_space.shape[0],  # pyright: ignore[reportOptionalSubscript]
         }
         env.action_space.seed(0)
-        env.reset(seed=0)
-        env.step(env.action_space.sample())
-        env.close()
+        with closing(env):
+            env.reset(seed=0)
+            env.step(env.action_space.sample())
         for key, value in found.items():
             if getattr(self, key) not in (None, value):
                 raise ValueError(f"task.{key} is {value} in {self.id}, got {getattr(self, key)}.")
@@ -134,7 +136,9 @@ class GymEnvs(ReplayedEnv):
         self.action_spec = Bounded(-1.0, 1.0, shape=(*batch, facts["action_dim"]))
         self._make_ends()
         self._make_memory()
-        self.envs = [self._make() for _ in range(num_envs)]
+        self.envs: list[gymnasium.Env] = []  # those that are there can be closed where the next one fails
+        for _ in range(num_envs):
+            self.envs.append(self._make())
         self.set_seed(seed)
 
     def _make(self) -> gymnasium.Env:
@@ -174,6 +178,35 @@ class GymEnvs(ReplayedEnv):
         for env in self.envs:
             env.close()
         super().close(**kwargs)
+
+
+class _Placed(gymnasium.Wrapper):
+    """Says where an environment failed, whose author alone can mend it."""
+
+    def __init__(self, env: gymnasium.Env, name: str):
+        super().__init__(env)
+        self.name = name
+
+    def _fault(self, what: str, error: Exception) -> ValueError:
+        frames = traceback.extract_tb(error.__traceback__)
+        own = [frame for frame in frames[1:] if "site-packages" not in frame.filename]
+        place = (own or frames)[-1]
+        return ValueError(
+            f"task.id: {self.name} failed in {what}: {type(error).__name__}: {error} "
+            f"({place.filename}, line {place.lineno}, in {place.name})"
+        )
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        try:
+            return self.env.reset(**options)
+        except Exception as error:
+            raise self._fault("reset", error) from error
+
+    def step(self, action: Any) -> tuple[Any, ...]:
+        try:
+            return self.env.step(action)
+        except Exception as error:
+            raise self._fault("step", error) from error
 
 
 _COST = "saferl_cost"

@@ -128,6 +128,7 @@ class ReplayedEnv(SeededEnv):
         self._seeds = torch.zeros(count, dtype=torch.int64)
         self._actions: list[list[np.ndarray]] = [[] for _ in range(count)]
         self._last: list[dict[str, Any]] = [{} for _ in range(count)]
+        self.is_closed = False  # TorchRL closes no environment that does not say so
 
     def _start(self, index: int, seed: int) -> dict[str, Any]:
         """What an environment shows at the start of its episode ``seed``, by key, without batch dimension."""

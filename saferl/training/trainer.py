@@ -149,6 +149,10 @@ class Trainer:
         path = self.checkpoint.load_latest()
         log.info("Resumed %s at frame %d.", path, self.progress.frames)
 
+    def close(self) -> None:
+        """Close the environments: a simulator may be one of which a process holds only one."""
+        self.collector.shutdown()
+
     @property
     def spent(self) -> float:
         """Fraction of the budget that is spent, in [0, 1]."""

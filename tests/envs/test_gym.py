@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.spaces import Box
+from small import SMALL
 from torchrl.envs.utils import check_env_specs
 from walk import constant
 
@@ -135,3 +138,50 @@ def test_an_observation_that_is_no_number():
     env.envs[0].unwrapped.place[:] = np.nan
     with pytest.raises(ValueError, match="test/Walk-v0 gave observation=.*nan"):
         env._advance(0, np.zeros(1, np.float32))
+
+
+class Engine(gymnasium.Env):
+    """A simulator of which a process holds one, that fails at a place of its author's."""
+
+    observation_space = Box(-1.0, 1.0, (2,), np.float32)
+    action_space = Box(-1.0, 1.0, (1,), np.float32)
+    alive = 0
+
+    def __init__(self, fails_in: str = ""):
+        if Engine.alive:
+            raise RuntimeError("this process holds an engine already")
+        Engine.alive, self.fails_in = 1, fails_in
+
+    def _fail(self, where: str) -> None:
+        if self.fails_in == where:
+            np.zeros(3) + np.zeros(4)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._fail("reset")
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self._fail("step")
+        return np.zeros(2, np.float32), 0.0, False, False, {"cost": 0.0}
+
+    def close(self):
+        Engine.alive = 0
+
+
+gymnasium.register("test/Engine-v0", Engine, max_episode_steps=6)
+
+
+def test_who_makes_an_environment_closes_it(command, tmp_path):
+    """Training and closing test, each with an engine of which a process holds one."""
+    options = (*SMALL, "task=gym", "task.id=test/Engine-v0", "algo=rsac", "env.num_envs=1")
+    command("train", "config", *options, "evaluation.num_envs=1", "out=run")
+    assert (tmp_path / "run/evaluation/metrics.json").is_file() and not Engine.alive
+
+
+@pytest.mark.parametrize("where", ["reset", "step"])
+def test_a_fault_of_an_environment_says_where(where: str):
+    told = rf"test/Engine-v0 failed in {where}: ValueError: oper.*test_gym.py, line \d+, in _fail"
+    with pytest.raises(ValueError, match=told):
+        GymEnvs(GymTask("test/Engine-v0", kwargs={"fails_in": where}))
+    assert not Engine.alive
