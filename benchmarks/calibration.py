@@ -32,7 +32,9 @@ def calibrate(run: Path, episodes: int, frequency: int) -> dict[str, float]:
     if not hasattr(agent.loss, "cost_value"):
         raise SystemExit(f"{run}: algo={cfg.algo_name} has no cost critic.")
     task = hydra.utils.instantiate(cfg.task).as_test()
-    env = BatchedIntersection(dataclasses.replace(task, policy_frequency=frequency), episodes)
+    env = BatchedIntersection(
+        dataclasses.replace(task, policy_frequency=frequency), episodes, seed=0
+    )
     steps = play(agent.actor, env, episode_seeds(cfg.seed, episodes))
     alive = torch.stack([step["alive"] for step in steps])
     cost = torch.stack([step["next", "cost"].squeeze(-1) for step in steps]) * alive

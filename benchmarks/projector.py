@@ -72,7 +72,7 @@ def main() -> None:
     ours, printed = ensemble(MMAMValue), ensemble(PlainMMAMValue)
     printed.load_state_dict(ours.state_dict())
     # Everything is risky, and no action is good enough to end early. The box is the environment's.
-    road = BatchedIntersection(Scenario(observation="world"), device=options.device)
+    road = BatchedIntersection(Scenario(observation="world"), device=options.device, seed=0)
     forms = {
         name: TransformedEnv(
             road, SafetyProjector(ours, -1e9, steps=options.steps, compile=name == "compiled")

@@ -35,7 +35,9 @@ class Ours:
         self.name = f"B={batch} {'compiled' if compiled else 'eager'}"
         begin = time.perf_counter()
         scenario = Scenario(task="mixed")
-        self.env = BatchedIntersection(scenario, batch, device=device, compile_physics=compiled)
+        self.env = BatchedIntersection(
+            scenario, batch, device=device, compile_physics=compiled, seed=0
+        )
         self.batch, self.compiled, self.device = batch, compiled, device
         self.generator = torch.Generator(device).manual_seed(0)
         self.data = self.env.reset()

@@ -145,7 +145,7 @@ import sys
 import saferl, saferl.envs, saferl.envs.transforms, saferl.modules, saferl.objectives
 from saferl.envs.intersection import BatchedIntersection, Scenario
 from saferl.envs.intersection.drivers import CautiousDriver
-env = BatchedIntersection(Scenario(scenario="dense"), num_envs=2)
+env = BatchedIntersection(Scenario(scenario="dense"), num_envs=2, seed=0)
 env.rollout(3, CautiousDriver())
 env.reset()
 {LOADED}

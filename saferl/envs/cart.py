@@ -113,7 +113,7 @@ class CartEnv(SeededEnv):
     Args:
         task: its settings.
         num_envs: B.
-        seed: of the sequences of episodes.
+        seed: of the sequences of episodes; None: others each time.
         device: of the tensors.
 
     Reads ``action`` [B, 1] in [-1, 1]. Writes ``observation`` [B, 2], ``reward`` and ``cost`` [B, 1].
@@ -124,7 +124,7 @@ class CartEnv(SeededEnv):
 
     kept = (*SeededEnv.kept, "_seeds", "_steps", "_state")
 
-    def __init__(self, task: Cart, num_envs: int = 1, seed: int = 0, device=None):
+    def __init__(self, task: Cart, num_envs: int = 1, seed: int | None = None, device=None):
         super().__init__(task, num_envs, device)
         batch = self.batch_size
         self.observation_spec = Composite(observation=Unbounded(shape=(*batch, 2)), shape=batch)

@@ -111,7 +111,7 @@ class GymEnvs(ReplayedEnv):
     Args:
         task: which environment.
         num_envs: B.
-        seed: of the sequences of episodes.
+        seed: of the sequences of episodes; None: others each time.
         device: of the tensors.
 
     Reads ``action`` [B, A] in [-1, 1], rescaled to the environment's box. Writes ``observation`` [B, size]
@@ -126,7 +126,7 @@ class GymEnvs(ReplayedEnv):
     torch.Size([2, 3, 1])
     """
 
-    def __init__(self, task: GymTask, num_envs: int = 1, seed: int = 0, device=None):
+    def __init__(self, task: GymTask, num_envs: int = 1, seed: int | None = None, device=None):
         super().__init__(task, num_envs, device)
         batch, facts = self.batch_size, task.complete()
         self.horizon = facts["horizon"]
@@ -136,7 +136,9 @@ class GymEnvs(ReplayedEnv):
         self.action_spec = Bounded(-1.0, 1.0, shape=(*batch, facts["action_dim"]))
         self._make_ends()
         self._make_memory()
-        self.envs: list[gymnasium.Env] = []  # those that are there can be closed where the next one fails
+        self.envs: list[
+            gymnasium.Env
+        ] = []  # those that are there can be closed where the next one fails
         for _ in range(num_envs):
             self.envs.append(self._make())
         self.set_seed(seed)

@@ -5,6 +5,7 @@ No generator is shared: what happens in an episode follows from its own 31-bit s
 
 from __future__ import annotations
 
+import secrets
 from typing import Any
 
 import numpy as np
@@ -50,7 +51,7 @@ class SeededEnv(EnvBase):
 
     ``env.reset(seeds=...)`` plays the episodes of these seeds, B integers, with or without transforms around the
     environment; the sequences stand still. Without them every environment goes on in its own sequence, which follows
-    from ``set_seed``.
+    from ``set_seed``, or is another one each time.
 
     Args:
         task: its settings.
@@ -85,8 +86,10 @@ class SeededEnv(EnvBase):
         self.to(self.device) if self.device is not None else None
 
     def _set_seed(self, seed: int | None) -> None:
+        # Copies of one constructor, as workers make them, must not play the same episodes unasked.
+        seed = secrets.randbits(31) if seed is None else int(seed)
         index = torch.arange(self.batch_size[0], dtype=torch.int64, device=self.device)
-        self._stream = mix(mix(torch.full_like(index, int(seed or 0)), 0) + index, 0)
+        self._stream = mix(mix(torch.full_like(index, seed), 0) + index, 0)
         self._episode = torch.zeros_like(self._stream)
 
     def _next_seeds(self, reset: Tensor, seeds: Tensor | None = None) -> Tensor:

@@ -258,7 +258,7 @@ def test_snapshot_is_the_state_of_one_environment():
 @pytest.mark.parametrize("scenario", ["nominal", "dense", "noisy"])
 def test_the_state_is_always_laid_out_alike(scenario, num_envs):
     """Scenes side by side, after steps and resets: other strides would be compiled once more."""
-    env, strides = BatchedIntersection(Scenario(scenario=scenario), num_envs), set()
+    env, strides = BatchedIntersection(Scenario(scenario=scenario), num_envs, seed=0), set()
     view, resets = env.reset(), 0
     for action in noise(40, num_envs):
         step, view = env.step_and_maybe_reset(view.set("action", action))
@@ -298,7 +298,7 @@ def test_compiled_is_eager(scenario, num_envs):
 def test_respawning_keeps_the_number_that_was_drawn():
     """Vehicles that leave are replaced; an episode never has more than it was drawn with."""
     fixed = Scenario(task="lt", scenario="dense", traffic={"vehicles": (6, 6)})
-    env = BatchedIntersection(fixed, 16)
+    env = BatchedIntersection(fixed, 16, seed=0)
     numbers = []
     data = env.reset()
     for _ in range(60):
@@ -310,7 +310,7 @@ def test_respawning_keeps_the_number_that_was_drawn():
 
 
 def test_an_action_of_another_precision_changes_no_type():
-    env = BatchedIntersection(Scenario(task="gs"), 2)
+    env = BatchedIntersection(Scenario(task="gs"), 2, seed=0)
     data = env.reset().set("action", torch.zeros(2, 2, dtype=torch.float64))
     after = env.step(data)["next"]
     assert all(after[key].dtype == torch.float32 for key in ("ego", "vehicles", "reward", "cost"))

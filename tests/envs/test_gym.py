@@ -33,7 +33,7 @@ def test_specs_costs_and_ends():
 
 def test_a_step_of_six_values_says_its_cost():
     """As Safety-Gymnasium's, whatever info has."""
-    env = GymEnvs(GymTask("test/Six-v0", horizon=3), num_envs=1)
+    env = GymEnvs(GymTask("test/Six-v0", horizon=3), num_envs=1, seed=0)
     data = env.rollout(9, constant(0.0), break_when_any_done=True)
     torch.testing.assert_close(data["next", "cost"], torch.full((1, 3, 1), 2.0))
     assert bool(data["next", "truncated"][0, -1])
@@ -41,7 +41,7 @@ def test_a_step_of_six_values_says_its_cost():
 
 def test_termination_on_the_last_step_stays_a_termination():
     """docs/pitfalls.md, 2 and 12."""
-    env = GymEnvs(GymTask("test/Walk-v0"), num_envs=1)
+    env = GymEnvs(GymTask("test/Walk-v0"), num_envs=1, seed=0)
     env.envs[0].unwrapped.far = 20.0 - 1e-3
     env.reset()
     env.envs[0].unwrapped.place[:] = 0.0
@@ -83,7 +83,7 @@ def test_seeds_decide_episodes_and_state_replays_them():
 )
 def test_refuses(task: GymTask, message: str):
     with pytest.raises(ValueError, match=message):
-        GymEnvs(task, num_envs=1)
+        GymEnvs(task, num_envs=1, seed=0)
 
 
 def test_a_missing_cost_is_named_before_anything_starts():
@@ -91,14 +91,14 @@ def test_a_missing_cost_is_named_before_anything_starts():
         ValueError, match=r"task.cost_key: info has no 'collision', it has \['cost'"
     ):
         GymTask("test/Walk-v0", cost_key="collision").complete()
-    free = GymEnvs(GymTask("test/Walk-v0", cost_key=None), num_envs=1)
+    free = GymEnvs(GymTask("test/Walk-v0", cost_key=None), num_envs=1, seed=0)
     assert free.rollout(2, constant(1.0))["next", "cost"].eq(0).all()
 
 
 @pytest.mark.parametrize("name", ["test/Six-v0", "test/SixLimited-v0"])
 def test_six_values_under_a_time_limit(name: str):
     """Which gymnasium's own wrapper would not pass on."""
-    env = GymEnvs(GymTask(name, horizon=None if "Limited" in name else 3), num_envs=1)
+    env = GymEnvs(GymTask(name, horizon=None if "Limited" in name else 3), num_envs=1, seed=0)
     assert env.rollout(9, constant(0.0)).shape[1] == 3
 
 
@@ -120,20 +120,20 @@ def test_a_horizon_takes_the_place_of_the_environments_limit():
     ],
 )
 def test_what_is_no_cost(cost, message: str):
-    env = GymEnvs(GymTask("test/Walk-v0"), num_envs=1)
+    env = GymEnvs(GymTask("test/Walk-v0"), num_envs=1, seed=0)
     env.envs[0].unwrapped.priced = lambda speed: cost
     with pytest.raises(ValueError, match=message):
         env.rollout(1, constant(0.0))
 
 
 def test_a_cost_in_an_array_of_one():
-    env = GymEnvs(GymTask("test/Walk-v0"), num_envs=1)
+    env = GymEnvs(GymTask("test/Walk-v0"), num_envs=1, seed=0)
     env.envs[0].unwrapped.priced = lambda speed: np.array([[2]])
     assert env.rollout(1, constant(0.0))["next", "cost"].item() == 2.0
 
 
 def test_an_observation_that_is_no_number():
-    env = GymEnvs(GymTask("test/Walk-v0"), num_envs=1)
+    env = GymEnvs(GymTask("test/Walk-v0"), num_envs=1, seed=0)
     env.reset()
     env.envs[0].unwrapped.place[:] = np.nan
     with pytest.raises(ValueError, match="test/Walk-v0 gave observation=.*nan"):
@@ -183,5 +183,5 @@ def test_who_makes_an_environment_closes_it(command, tmp_path):
 def test_a_fault_of_an_environment_says_where(where: str):
     told = rf"test/Engine-v0 failed in {where}: ValueError: oper.*test_gym.py, line \d+, in _fail"
     with pytest.raises(ValueError, match=told):
-        GymEnvs(GymTask("test/Engine-v0", kwargs={"fails_in": where}))
+        GymEnvs(GymTask("test/Engine-v0", kwargs={"fails_in": where}), seed=0)
     assert not Engine.alive

@@ -51,7 +51,7 @@ def test_mujocos_runners(runner: str):
     pytest.importorskip("mujoco")
     pytest.importorskip("imageio")
     task = GymTask(f"saferl.envs.speed:saferl/{runner}Speed-v0", kwargs={"limit": 1e-6})
-    env = GymEnvs(task, num_envs=2)
+    env = GymEnvs(task, num_envs=2, seed=0)
     assert env.horizon == 1000
     data = env.rollout(3)
     assert data["next", "cost"].eq(1).all() and data["next", "reward"].isfinite().all()

@@ -35,7 +35,7 @@ def gentle(count, *shape, seed=0):
 
 @pytest.mark.parametrize(("task", "vehicles"), [("lt", 10), ("gs", 3), ("rt", 0), ("mixed", 10)])
 def test_specs(task, vehicles):
-    env = HighwayIntersection(Scenario(task=task, vehicles=vehicles), num_envs=2)
+    env = HighwayIntersection(Scenario(task=task, vehicles=vehicles), num_envs=2, seed=0)
     check_env_specs(env, seed=0)
     for key in ("reward", "cost"):
         spec = env.full_reward_spec[key]

@@ -79,7 +79,9 @@ def test_an_episode_is_a_function_of_its_seed_alone(kind, scenario, driver, proj
 
 def test_figures_against_gymnasium_by_hand():
     """The same episode through the gymnasium environment, summed in a plain loop."""
-    row = evaluate(Driver(), HighwayIntersection(TRAFFIC, num_envs=2), 1, seed=7, progress=False)[0]
+    row = evaluate(
+        Driver(), HighwayIntersection(TRAFFIC, num_envs=2, seed=0), 1, seed=7, progress=False
+    )[0]
     env = IntersectionEnv(task="gs", vehicles=4, policy_frequency=5, duration=12.0)
     observation, info = env.reset(seed=row["seed"])
     rewards, costs, speeds, distances, done = [], [], [], [], False
@@ -117,7 +119,7 @@ def test_conditions_of_a_test():
     assert scenario == Scenario(policy_frequency=10)
     rows = evaluate(
         TensorDictModule(lambda ego: ego[..., :2] * 0 + torch.tensor([-1.0, 0.0]), ["ego"], ["action"]),
-        BatchedIntersection(Scenario(vehicles=0, duration=8.0).as_test(), num_envs=6),
+        BatchedIntersection(Scenario(vehicles=0, duration=8.0).as_test(), num_envs=6, seed=0),
         6, seed=0, progress=False,
     )  # fmt: skip
     # Braking at once: all stay on the approach, stand there, and play on to the limit.
@@ -128,24 +130,32 @@ def test_interventions_are_shares_of_decisions():
     """A risk above the limit for ever: every decision is corrected, by the whole reach."""
     risk = TensorDictModule(lambda action: 10 + action[..., :1], ["action"], ["risk"])
     projector = SafetyProjector(risk, limit=0.0, steps=5, step_size=0.02, penalty=1e6)
-    env = TransformedEnv(BatchedIntersection(ROAD, num_envs=2), projector)
+    env = TransformedEnv(BatchedIntersection(ROAD, num_envs=2, seed=0), projector)
     rows = evaluate(Driver(), env, 2, seed=0, progress=False)
     assert all(row["intervention_rate"] == pytest.approx(1.0, abs=0.1) for row in rows)
-    plain = evaluate(Driver(), BatchedIntersection(ROAD, num_envs=2), 2, seed=0, progress=False)
+    plain = evaluate(
+        Driver(), BatchedIntersection(ROAD, num_envs=2, seed=0), 2, seed=0, progress=False
+    )
     assert all(row["intervention_rate"] == row["correction"] == 0.0 for row in plain)
 
 
 def test_nothing_after_the_end_counts():
     """In a batch the others play on; a wreck may meanwhile be anywhere, at any speed."""
     rows = evaluate(
-        RandomDriver(seed=1), BatchedIntersection(ROAD, num_envs=8), 8, seed=0, progress=False
+        RandomDriver(seed=1),
+        BatchedIntersection(ROAD, num_envs=8, seed=0),
+        8,
+        seed=0,
+        progress=False,
     )
     assert len({row["decisions"] for row in rows}) > 1
     assert all(0 < row["speed"] < 20 and abs(row["return"]) < 1000 for row in rows)
 
 
 def test_write(tmp_path: Path):
-    rows = evaluate(Driver(), BatchedIntersection(ROAD, num_envs=3), 3, seed=0, progress=False)
+    rows = evaluate(
+        Driver(), BatchedIntersection(ROAD, num_envs=3, seed=0), 3, seed=0, progress=False
+    )
     figures = write(rows, tmp_path / "new", policy="blind", seed=0)
     stored = json.loads((tmp_path / "new/metrics.json").read_text())
     assert {key: stored[key] for key in FIGURES} == figures and stored["policy"] == "blind"
@@ -153,7 +163,7 @@ def test_write(tmp_path: Path):
     lines = (tmp_path / "new/episodes.csv").read_text().splitlines()
     assert len(lines) == 4 and lines[0].startswith("episode,seed,route,collision")
     with pytest.raises(ValueError, match="episodes must be >= 1"):
-        evaluate(Driver(), BatchedIntersection(ROAD, num_envs=1), 0, seed=0)
+        evaluate(Driver(), BatchedIntersection(ROAD, num_envs=1, seed=0), 0, seed=0)
 
 
 def test_a_runs_closing_test_is_the_evaluation_of_its_checkpoint(tmp_path: Path, command):

@@ -250,12 +250,9 @@ class IntersectionBase(SeededEnv):
     Reads ``action`` [B, 2] in [-1, 1]: a_x / 5 m/s^2, delta_f / 0.6 rad. Writes ``ego`` [B, F] and
     ``vehicles`` [B, M, G] (:func:`observe`), ``route`` [B, 1] int64, the outcomes ``collision``,
     ``offroad``, ``success`` [B, 1] bool, and ``reward`` and ``cost`` [B, 1].
-
-    A reset may be told which episodes to play by an int64 key ``seed`` [B] or [B, 1]; without it
-    every environment goes on in its own sequence of episodes, which follows from ``set_seed``.
     """
 
-    def __init__(self, task: Scenario, num_envs: int, seed: int, device=None):
+    def __init__(self, task: Scenario, num_envs: int, seed: int | None, device=None):
         super().__init__(task, num_envs, device)
         self._make_specs()
         self.set_seed(seed)

@@ -199,7 +199,7 @@ class BatchedIntersection(IntersectionBase):
     Args:
         task: its settings.
         num_envs: B.
-        seed: of the sequences of episodes.
+        seed: of the sequences of episodes; None: others each time.
         device: torch device.
         compile_physics: compile the step and the reset: three times faster, after minutes (or seconds,
             once torch has it in its cache on disk).
@@ -213,7 +213,7 @@ class BatchedIntersection(IntersectionBase):
         self,
         task: Scenario,
         num_envs: int = 1,
-        seed: int = 0,
+        seed: int | None = None,
         device=None,
         compile_physics: bool = False,
     ):

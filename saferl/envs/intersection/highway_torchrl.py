@@ -23,7 +23,7 @@ class HighwayIntersection(ReplayedEnv, IntersectionBase):
     Args:
         task: its settings.
         num_envs: B.
-        seed: of the sequences of episodes.
+        seed: of the sequences of episodes; None: others each time.
         device: of the tensors; the simulation itself runs on the CPU.
 
     >>> env = HighwayIntersection(Scenario(task="gs", vehicles=2), num_envs=2)
@@ -31,7 +31,7 @@ class HighwayIntersection(ReplayedEnv, IntersectionBase):
     torch.Size([2, 2, 1])
     """
 
-    def __init__(self, task: Scenario, num_envs: int = 1, seed: int = 0, device=None):
+    def __init__(self, task: Scenario, num_envs: int = 1, seed: int | None = None, device=None):
         super().__init__(task, num_envs, seed, device)
         fields = [f.name for f in dataclasses.fields(task) if f.name != "test_frequency"]
         settings = {name: getattr(task, name) for name in fields}
