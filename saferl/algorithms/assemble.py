@@ -20,6 +20,7 @@ from saferl.checkpoint.run import FOLDER, latest, load_component, run_config
 from saferl.checkpoint.state import Fitting, Networks
 from saferl.config.check import arguments, check, check_targets, check_task
 from saferl.envs.task import Task
+from saferl.training.experience import check_memory
 from saferl.training.progress import Budget
 from saferl.training.records import EpisodeWindow
 from saferl.training.signals import ProjectorProgress
@@ -183,10 +184,14 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         auto_register_policy_transforms=False,
     )
     learner = algorithm.learner(agent.loss, cfg.compile)
+    experience = algorithm.experience(agent, learner, parts.task, make_env, num_envs, cfg.seed)
+    stored = env.fake_tensordict().select(*agent.stored, strict=False)
+    capacity = experience.buffer.storage.max_size
+    check_memory(algorithm.kept, capacity, stored, torch.device(parts.device))
     trainer = Trainer(
         run=run,
         collector=collector,
-        experience=algorithm.experience(agent, learner, parts.task, make_env, num_envs, cfg.seed),
+        experience=experience,
         learner=learner,
         window=EpisodeWindow(parts.task.outcomes),
         budget=Budget(cfg.episodes, cfg.frames),

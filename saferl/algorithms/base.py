@@ -59,10 +59,12 @@ class Algorithm(ABC):
     Attributes:
         values: the argument by which a loss of this family takes the values of rewards.
         risks: the argument by which it takes Q_c(s, a), if it does.
+        kept: the option that says how many transitions are kept.
     """
 
     values: ClassVar[str]
     risks: ClassVar[str]
+    kept: ClassVar[str]
     initial_std: float
     lr: Any
 

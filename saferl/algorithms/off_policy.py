@@ -32,6 +32,7 @@ class OffPolicy(OffPolicyLearning, Algorithm):
 
     values: ClassVar[str] = "qvalue_network"
     risks: ClassVar[str] = "cost_critic"
+    kept: ClassVar[str] = "learning.buffer_size"
 
     def loss_parts(self, networks: NetworkBuilder) -> dict[str, Callable[[], Any]]:
         critic = networks.parts.critic

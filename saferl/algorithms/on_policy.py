@@ -36,6 +36,7 @@ class OnPolicy(OnPolicyLearning, Algorithm):
 
     values: ClassVar[str] = "critic_network"
     risks: ClassVar[str] = "risk_critic"
+    kept: ClassVar[str] = "learning.rollout_frames"
 
     def check(self, parts: Parts) -> None:
         super().check(parts)

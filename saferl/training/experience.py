@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -15,6 +17,40 @@ from saferl.checkpoint.state import BufferState
 
 def _flat(data: TensorDictBase, keys: Sequence[NestedKey]) -> TensorDictBase:
     return data.select(*keys, strict=False).contiguous().reshape(-1)
+
+
+def memory(device: torch.device) -> int:
+    """Bytes that a device has in all; on a CPU not more than the process may have, and no end where the system does not say."""
+    if device.type == "cuda":
+        return torch.cuda.mem_get_info(device)[1]
+    try:
+        import resource
+    except ImportError:  # not a Unix
+        return sys.maxsize
+    allowed = resource.getrlimit(resource.RLIMIT_AS)[0]
+    there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return there if allowed == resource.RLIM_INFINITY else min(there, allowed)
+
+
+def check_memory(option: str, count: int, transition: TensorDictBase, device: torch.device) -> None:
+    """Refuse to keep more transitions than fit.
+
+    Args:
+        option: that says how many.
+        count: of them.
+        transition: one, or a batch [B] of them, as it is kept.
+        device: where.
+
+    Raises:
+        ValueError: says how much memory they take and how much there is.
+    """
+    size = transition.bytes() / transition.numel()
+    there = memory(device)
+    if count * size > there:
+        raise ValueError(
+            f"{option} must be <= {int(there / size)}, got {count}: a transition takes {size:,.0f} bytes, all of them "
+            f"{count * size / 2**30:.1f} GiB, and {device} has {there / 2**30:.1f} GiB."
+        )
 
 
 class Replay:

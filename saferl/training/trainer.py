@@ -16,6 +16,7 @@ from typing import Any, Protocol
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
+from torchrl.data import ReplayBuffer
 from torchrl.record.loggers import Logger
 from tqdm import tqdm
 
@@ -30,6 +31,8 @@ log = logging.getLogger(__name__)
 
 class Experience(Protocol):
     """What the trainer asks of :mod:`saferl.training.experience`."""
+
+    buffer: ReplayBuffer
 
     def prepare(self) -> None: ...
 

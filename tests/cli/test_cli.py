@@ -392,3 +392,17 @@ def test_a_mistake_in_a_process_of_its_own(spawn, tmp_path: Path):
     assert process.returncode == 1 and out == ""
     assert err == "error: gamma must be >= 0 and <= 1, got 1.2.\n"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_buffer_that_cannot_fit_is_refused(refusal, monkeypatch):
+    """With what a transition takes: 9 + 66 numbers of either state and what else is kept of it."""
+    monkeypatch.setattr("saferl.training.experience.memory", lambda device: 2**20)
+    options = (*TRAIN, *SMALL, *EMPTY, "algo=sac", "task.observation=world", "task.rows=11")
+    line = refusal(*options, "learning.buffer_size=3000")
+    found = re.search(
+        r"learning.buffer_size must be <= (\d+), got 3000: a transition takes (\d+)", line
+    )
+    assert found and int(found[1]) == 2**20 // int(found[2]) and "cpu has 0.0 GiB" in line
+    assert 4 * 2 * (9 + 66) < int(found[2]) < 4 * 2 * (9 + 66) + 100
+    line = refusal(*TRAIN, *SMALL, *EMPTY, "algo=ppo", "learning.rollout_frames=9000")
+    assert "learning.rollout_frames must be <= " in line
