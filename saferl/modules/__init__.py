@@ -1,14 +1,9 @@
 """Networks, critics, multipliers and the projection that algorithms are composed of."""
 
 from saferl.modules.actors import GaussianHead, tanh_gaussian_actor
-from saferl.modules.critics import (
-    BoundCritics,
-    CriticEnsemble,
-    StateValue,
-    value_operator,
-    zero_output,
-)
+from saferl.modules.critics import StateValue, value_operator, zero_output
 from saferl.modules.encoder import Encoder
+from saferl.modules.ensemble import BoundCritics, CriticEnsemble
 from saferl.modules.exploration import HeldActions
 from saferl.modules.lagrange import DualAscent, LagrangeMultiplier, PIDMultiplier
 from saferl.modules.mlp import MLP, MLPPolicyEncoder, MLPValue

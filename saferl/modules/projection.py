@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from saferl.modules.compiled import Compiled
-from saferl.modules.critics import BoundCritics
+from saferl.modules.ensemble import BoundCritics
 
 #: Steps between two looks at whether any sample still moves, in compiled code.
 _TOGETHER = 5

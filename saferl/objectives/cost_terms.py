@@ -18,7 +18,7 @@ from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import distance_loss
 
 from saferl.modules import BoundCritics, CriticEnsemble, LagrangeMultiplier, Largest
-from saferl.modules.critics import REDUCTIONS
+from saferl.modules.ensemble import REDUCTIONS
 from saferl.objectives.adapter import LossMixin
 from saferl.objectives.checks import (
     check_choice,
