@@ -43,7 +43,8 @@ def launch(command: str, config: str) -> None:
             for key in PATHS:
                 if cfg.get(key) == "":
                     raise ValueError(f"{key} must be a path, got ''.")
-            schema.check(cfg)
+            if cfg.get("resume") is None:  # else the run's own is checked
+                schema.check(cfg)
             # Late: help and most mistakes need no torch.
             getattr(importlib.import_module(f"saferl.cli.{command}"), command)(cfg)
         except BaseException as error:

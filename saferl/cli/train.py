@@ -39,19 +39,14 @@ def train(cfg: DictConfig) -> None:
         else:
             claim(run, cfg)
     else:
-        others = [o for o in HydraConfig.get().overrides.task if not o.startswith("resume=")]
-        if others:
-            raise ValueError(
-                "resume continues a run as it was configured and takes no other option, "
-                f"got {', '.join(others)}."
-            )
         run = run_folder(Path(str(cfg.resume)), "resume")
-        cfg = run_config(run)
+        cfg = prolonged(run_config(run), cfg, HydraConfig.get().overrides.task)
     with alone(run, "resume" if resuming else "out"):
         try:
             with closing(build_trainer(cfg, run)) as trainer:
                 if resuming:
                     trainer.resume()
+                    keep(cfg, run)
                 log.info(
                     "%s on %s, seed %d. Files: %s", cfg.algo_name, cfg.task.task, cfg.seed, run
                 )
@@ -107,6 +102,40 @@ def closing_test(cfg: DictConfig, run: Path) -> None:
     pictures(
         cfg.env, task, policy, transforms, results[cfg.algo_name][: settings.gif], out, cfg.device
     )
+
+
+def prolonged(own: DictConfig, asked: DictConfig, overrides: Sequence[str]) -> DictConfig:
+    """The configuration of a run that goes on, with a larger budget if one is asked for.
+
+    Args:
+        own: the run's.
+        asked: as the command line composes it.
+        overrides: of the command line.
+
+    Raises:
+        ValueError: anything else is asked for.
+    """
+    budget = "episodes" if own.frames is None else "frames"
+    others = [each for each in overrides if not each.startswith(("resume=", f"{budget}="))]
+    if others:
+        raise ValueError(
+            f"resume continues a run as it was configured and takes no other option than a larger {budget}=, "
+            f"got {', '.join(others)}."
+        )
+    if any(each.startswith(f"{budget}=") for each in overrides):
+        if asked[budget] is None or asked[budget] < own[budget]:
+            raise ValueError(
+                f"{budget} must be >= {own[budget]}, the run's own, got {asked[budget]}."
+            )
+        own[budget] = asked[budget]
+    return own
+
+
+def keep(cfg: DictConfig, run: Path) -> None:
+    """Write a run's configuration, or leave the one that is there whole."""
+    part = run / f"{CONFIG}.part"
+    OmegaConf.save(cfg, part)
+    part.replace(run / CONFIG)
 
 
 def begun(run: Path, cfg: DictConfig) -> bool:

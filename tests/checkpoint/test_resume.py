@@ -267,3 +267,24 @@ def test_loggers_open_when_training_starts(tmp_path: Path, refusal, monkeypatch)
     line = refusal("train", "config", *options, "out=new")
     assert "TensorboardLogger needs a package that is not installed (no tensorboard)" in line
     assert not (tmp_path / "new").exists()
+
+
+def test_a_finished_run_goes_on_with_a_larger_budget(tmp_path: Path, command, refusal):
+    """As if it had had it from the start, but for schedules, which are those of the larger one from there on."""
+    rates = [f"learning.lr.{name}=[1e-3,1e-3]" for name in ("actor", "critic", "alpha")]
+    options = (*SMALL, "task=cart", "algo=sac", *rates)
+    command("train", "config", *options, "frames=24", "out=run")
+    assert "frames must be >= 24, the run's own, got 16" in refusal(
+        "train", "config", "resume=run", "frames=16"
+    )
+    assert "other option than a larger frames=" in refusal(
+        "train", "config", "resume=run", "episodes=99"
+    )
+    command("train", "config", "resume=run", "frames=48")
+    command("train", "config", *options, "frames=48", "out=whole")
+    run, whole = tmp_path / "run", tmp_path / "whole"
+    for name in ("metrics.csv", "evaluation/episodes.csv"):
+        assert (run / name).read_bytes() == (whole / name).read_bytes()
+    assert OmegaConf.load(run / "config.yaml").frames == 48  # pyright: ignore
+    states = [restored(path, *options, "frames=48") for path in (run, whole)]
+    assert_same(*map(everything, states))

@@ -74,7 +74,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_is_not_written_over_nor_reconfigured(run: Path, refusal):
     assert "holds a run already; continue it with resume=" in refusal(*TRAIN, f"out={run}")
     line = refusal(*TRAIN, f"resume={run}", "gamma=0.9", "out=x")
-    assert "takes no other option, got gamma=0.9, out=x" in line
+    assert "takes no other option than a larger frames=, got gamma=0.9, out=x" in line
     line = refusal(*TRAIN, *SMALL, *EMPTY, f"init={run}", "algo=sac", "encoder.width=24")
     assert "task.rows is 2 there and 11 here, encoder.width is 16 there and 24 here" in line
     assert "task.rows must be 2" in refusal(*TEST, f"checkpoint={run}", "task.rows=3")
@@ -327,7 +327,7 @@ def test_the_readmes_everyday_commands_work_in_order(command, tmp_path: Path):
     readme = (Path(__file__).parents[2] / "README.md").read_text()
     block = readme.partition("## Everyday commands")[2].split("```")[1]
     lines = [line.partition("#")[0].split() for line in block.splitlines() if "-m saferl" in line]
-    assert len(lines) == 11
+    assert len(lines) == 12
     small = {"saferl": (*SMALL, *EMPTY), "saferl.evaluate": (*EMPTY, "episodes=1", "gif=0")}
     for _, _, module, *arguments in lines:
         name = module.partition(".")[2] or "train"
@@ -338,6 +338,8 @@ def test_the_readmes_everyday_commands_work_in_order(command, tmp_path: Path):
             continue
         if not any(argument.startswith("resume=") for argument in arguments):
             arguments += small.get(module, ())
+        elif len(arguments) > 1:
+            arguments[1] = "frames=32"
         command(name, "config" if name == "train" else name, *arguments)
     assert (tmp_path / "test/metrics.json").is_file() and (tmp_path / "policy").is_dir()
 
