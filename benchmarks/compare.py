@@ -14,7 +14,7 @@ import csv
 import json
 from pathlib import Path
 
-from saferl.evaluation.statistics import mean_interval
+from saferl.evaluation.statistics import mean_interval, span
 
 #: What two tests must have alike; their backends and their number of vehicle rows may differ.
 ALIKE = ("task", "scenario", "traffic", "vehicles", "reading", "policy_frequency", "seed")
@@ -52,7 +52,7 @@ def main() -> None:
         result[name] = {"a": means[0], "b": means[1], "low": low, "high": high}
         print(
             f"{name:13s}{means[0]:10.3f}{means[1]:10.3f}{means[0] - means[1]:+12.3f}"
-            f"  [{low:+.3f}, {high:+.3f}]"
+            f"  {span(low, high, '+.3f')}"
         )
     if options.json:
         options.json.parent.mkdir(parents=True, exist_ok=True)

@@ -19,7 +19,7 @@ from side_by_side import write
 from time_to_safe import ENDS, Work, carry_out, tests, train
 
 from saferl.envs.intersection.observation import FORMS
-from saferl.evaluation.statistics import mean_interval
+from saferl.evaluation.statistics import mean_interval, span
 
 BLANK = 1e9
 #: Whose features, and which.
@@ -81,8 +81,7 @@ def main() -> None:
         rates = figures[group] = {end: [100 * row[end] for row in ends] for end in ENDS}
         cells = []
         for values in rates.values():
-            low, high = mean_interval(values)
-            cells.append(f"{np.mean(values):.1f} [{low:.1f}, {high:.1f}]")
+            cells.append(f"{np.mean(values):.1f} {span(*mean_interval(values), '.1f')}")
         whole = figures["nothing"]["success"]
         missed = sum(one < all_ for one, all_ in zip(rates["success"], whole, strict=True))
         print(f"| {group} | {' | '.join(cells)} | {missed} of {seeds} |")

@@ -22,7 +22,7 @@ from torch.nn import functional as F
 
 from saferl.envs.intersection import BatchedIntersection, Scenario
 from saferl.envs.intersection.drivers import CautiousDriver, Driver
-from saferl.evaluation.statistics import mean_interval
+from saferl.evaluation.statistics import mean_interval, span
 from saferl.modules import MMAMPolicyEncoder
 
 ENVS, DECISIONS, NOISE, BATCH = 256, 400, 0.2, 256
@@ -99,8 +99,8 @@ def main() -> None:
     for keys, values in errors.items():
         print(f"keys={keys:10s} {' '.join(f'{value:.4f}' for value in values)}")
     ratios = [b / a - 1 for a, b in zip(*errors.values(), strict=True)]
-    low, high = mean_interval(ratios)
-    print(f"{FORMS[1]} over {FORMS[0]}: {sum(ratios) / len(ratios):+.1%} [{low:+.1%}, {high:+.1%}]")
+    interval = span(*mean_interval(ratios), "+.1%")
+    print(f"{FORMS[1]} over {FORMS[0]}: {sum(ratios) / len(ratios):+.1%} {interval}")
     write(options.json, errors)
 
 

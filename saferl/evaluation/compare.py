@@ -127,23 +127,25 @@ def cell(tests: Sequence[Mapping[str, Any]], name: str) -> str:
     >>> cell([{"episodes": 50, "success_rate": {"mean": 1.0}}] * 2, "success_rate")
     '100.0 [96.3, 100.0]'
     """
-    from saferl.evaluation.statistics import mean_interval, wilson
+    from saferl.evaluation.statistics import mean_interval, span, wilson, within
 
     if not tests:
         return "-"
     means = [test[name]["mean"] for test in tests]
     mean = sum(means) / len(means)
-    if len(means) == 1:
-        low, high = (tests[0][name][bound] for bound in ("low", "high"))
+    rate = name.endswith("_rate")
+    if len(means) > 1:
+        low, high = within(name, mean_interval(means), means)
     else:
-        low, high = mean_interval(means)
-    if not name.endswith("_rate"):
-        return f"{mean:.4g} [{low:.4g}, {high:.4g}]"
-    # Seeds that agree do not make a rate surer than its episodes.
-    episodes = sum(test["episodes"] for test in tests)
-    bounds = wilson(round(mean * episodes), episodes)
-    low, high = max(min(low, bounds[0]), 0.0), min(max(high, bounds[1]), 1.0)
-    return f"{100 * mean:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
+        low, high = (tests[0][name][bound] for bound in ("low", "high"))
+    if not rate:
+        return f"{mean:.4g} {span(low, high, '.4g')}"
+    if low is not None and high is not None:
+        # Seeds that agree do not make a rate surer than its episodes.
+        episodes = sum(test["episodes"] for test in tests)
+        least, most = wilson(round(mean * episodes), episodes)
+        low, high = min(low, least), max(high, most)
+    return f"{100 * mean:.1f} {span(low, high, '.1f', 100)}"
 
 
 def main(folders: list[str]) -> None:

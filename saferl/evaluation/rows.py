@@ -19,8 +19,8 @@ from saferl.evaluation.statistics import summarise
 def episode_rows(steps: list[TensorDictBase], seeds: Tensor, task: Task) -> list[dict]:
     """Figures of each episode of :func:`saferl.evaluation.play.play`: one dict an episode, in the order of ``seeds``.
 
-    Beside those of the task stand ``return``, ``cost_return``, ``intervention_rate``, the share of decisions that a
-    projector changed, ``correction``, the mean size of such a change, and ``decisions``.
+    Beside those of the task stand ``return``, ``cost_return`` and ``decisions``; where a projector was there, also
+    ``intervention_rate``, the share of decisions that it changed, and ``correction``, the mean size of such a change.
     """
     after = steps[0]["next"]
 
@@ -29,32 +29,25 @@ def episode_rows(steps: list[TensorDictBase], seeds: Tensor, task: Task) -> list
 
     counts = torch.stack([step["alive"] for step in steps]).sum(0).tolist()
     values = {"return": over_time("reward"), "cost_return": over_time("cost")}
-    shift = torch.zeros_like(values["cost_return"])
-    if "action_executed" in after:
+    if projected := "action_executed" in after:
         shift = torch.stack(
             [
                 torch.linalg.vector_norm(step["next", "action_executed"] - step["action"], dim=-1)
                 for step in steps
             ]
         ).cpu()
-    # A projector of one's own need not say where it intervened.
-    moved = over_time("intervened") if "intervened" in after else (shift > 0).to(shift)
-    values |= {"intervention_rate": moved, "correction": shift}
+        # A projector of one's own need not say where it intervened.
+        moved = over_time("intervened") if "intervened" in after else (shift > 0).to(shift)
+        values |= {"intervention_rate": moved, "correction": shift}
     rows, own = [], task.figures(steps, counts)
     for index, (seed, count) in enumerate(zip(seeds.tolist(), counts, strict=True)):
         # Exact sums: they do not depend on how long the episodes beside this one lasted.
         total = {key: math.fsum(value[:count, index].tolist()) for key, value in values.items()}
-        rows.append(
-            {
-                "seed": seed,
-                **own[index],
-                "return": total["return"],
-                "cost_return": total["cost_return"],
-                "intervention_rate": total["intervention_rate"] / count,
-                "correction": total["correction"] / max(total["intervention_rate"], 1.0),
-                "decisions": count,
-            }
-        )
+        if projected:
+            interventions = total["intervention_rate"]
+            total["intervention_rate"] = interventions / count
+            total["correction"] /= max(interventions, 1.0)
+        rows.append({"seed": seed, **own[index], **total, "decisions": count})
     return rows
 
 

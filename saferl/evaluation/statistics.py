@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -29,29 +30,61 @@ def wilson(successes: int, trials: int, level: float = 0.95) -> tuple[float, flo
     return float(interval.low), float(interval.high)
 
 
-def mean_interval(values: Sequence[float], level: float = 0.95) -> tuple[float, float]:
-    """Student's t interval of a mean; the mean itself when there is one value.
+Interval = tuple[float, float] | tuple[None, None]
+
+
+def mean_interval(values: Sequence[float], level: float = 0.95) -> Interval:
+    """Student's t interval of a mean; None twice where one value says nothing of it.
 
     >>> [round(bound, 2) for bound in mean_interval([1.0, 2.0, 3.0])]
     [-0.48, 4.48]
+    >>> mean_interval([1.0])
+    (None, None)
     """
     array = np.asarray(values, dtype=float)
-    if len(array) < 2 or np.ptp(array) == 0:
+    if len(array) < 2:
+        return None, None
+    if np.ptp(array) == 0:
         return float(array.mean()), float(array.mean())
     half = stats.t.ppf((1 + level) / 2, len(array) - 1) * stats.sem(array)
     return float(array.mean() - half), float(array.mean() + half)
 
 
-def summarise(rows: Sequence[dict[str, float]]) -> dict[str, dict[str, float]]:
+def within(name: str, interval: Interval, values: Sequence[float]) -> Interval:
+    """The interval of a figure without what the figure cannot be: a share outside [0, 1], a speed below 0, or a
+    cost below 0 where no value is.
+
+    >>> within("speed", (-0.5, 1.5), [0.0, 1.0]), within("cost_return", (-9.0, 1.0), [-4.0])
+    ((0.0, 1.5), (-9.0, 1.0))
+    """
+    low, high = interval
+    if low is None or high is None:
+        return None, None
+    share = name.endswith("_rate")
+    if share or (name in ("speed", "cost_return") and min(values) >= 0):
+        low = max(low, 0.0)
+    return low, min(high, 1.0) if share else high
+
+
+def span(low: float | None, high: float | None, form: str, scale: float = 1.0) -> str:
+    """An interval in brackets; "-" where there is none.
+
+    >>> span(0.5, 1.0, ".1f"), span(None, None, ".1f")
+    ('[0.5, 1.0]', '-')
+    """
+    return "-" if low is None or high is None else f"[{low * scale:{form}}, {high * scale:{form}}]"
+
+
+def summarise(rows: Sequence[dict[str, float]]) -> dict[str, dict[str, float | None]]:
     """Mean and 95% interval of each figure over episodes.
 
     Args:
-        rows: one dict an episode with ``return``, ``cost_return``, ``intervention_rate`` (share of its
-            decisions) and, on the road, ``collision``, ``success``, ``frozen`` (0 or 1) and ``speed``.
+        rows: one dict an episode with ``return``, ``cost_return``; with a projector ``intervention_rate`` (share of its
+            decisions); on the road ``collision``, ``success``, ``frozen`` (0 or 1) and ``speed``.
 
     Returns:
-        ``{figure: {"mean", "low", "high"}}``; Wilson's interval for rates of episodes, Student's t
-        otherwise (within [0, 1] for the intervention rate, a mean of shares).
+        ``{figure: {"mean", "low", "high"}}``; Wilson's interval for rates of episodes, Student's t otherwise, within
+        what the figure can be; ``low`` and ``high`` are None for a mean of one episode.
 
     Raises:
         ValueError: no rows.
@@ -64,20 +97,21 @@ def summarise(rows: Sequence[dict[str, float]]) -> dict[str, dict[str, float]]:
         if column not in rows[0]:
             continue
         values = [float(row[column]) for row in rows]
-        low, high = wilson(round(sum(values)), len(values)) if is_rate else mean_interval(values)
-        if name.endswith("_rate"):
-            low, high = max(low, 0.0), min(high, 1.0)
+        found = wilson(round(sum(values)), len(values)) if is_rate else mean_interval(values)
+        low, high = within(name, found, values)
         figures[name] = {"mean": sum(values) / len(values), "low": low, "high": high}
     return figures
 
 
-def table(figures: dict[str, dict[str, float]], title: str = "") -> str:
+def table(figures: dict[str, dict[str, Any]], title: str = "") -> str:
     """A plain-text table of :func:`summarise`'s figures; rates in percent."""
     lines = [title] if title else []
     lines.append(f"{'':<14}{'mean':>10}   95% interval")
     for name, value in figures.items():
         short, scale = FIGURES[name][0], 100.0 if name.endswith("_rate") else 1.0
         unit = " %" if scale == 100.0 else ""
-        mean, low, high = (value[key] * scale for key in ("mean", "low", "high"))
-        lines.append(f"{short:<14}{mean:>10.2f}{unit:<2} [{low:.2f}, {high:.2f}]{unit}")
+        interval = span(value["low"], value["high"], ".2f", scale)
+        lines.append(
+            f"{short:<14}{value['mean'] * scale:>10.2f}{unit:<2} {interval}{unit * (interval != '-')}"
+        )
     return "\n".join(lines)

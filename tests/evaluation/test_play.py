@@ -41,7 +41,8 @@ TRAFFIC = Scenario(task="gs", vehicles=4, policy_frequency=5, duration=12.0)
 def same(ours: list[dict], theirs: list[dict]) -> bool:
     """Equal rows; sums to float32 rounding, which may differ in the last lanes of a vector unit."""
     exact = ("episode", "seed", "route", "collision", "success", "decisions")
-    sums = ("return", "speed", "cost_return", "intervention_rate", "correction", "min_distance")
+    sums = ["return", "speed", "cost_return", "min_distance"]
+    sums += [key for key in ("intervention_rate", "correction") if key in ours[0]]
     return len(ours) == len(theirs) and all(
         [one[key] for key in exact] == [other[key] for key in exact]
         and [one[key] for key in sums] == pytest.approx([other[key] for key in sums], rel=1e-5)
@@ -74,7 +75,7 @@ def test_an_episode_is_a_function_of_its_seed_alone(kind, scenario, driver, proj
     assert [row["episode"] for row in alone] == [0, 1, 2, 3]
     assert len({row["return"] for row in alone}) == 4
     assert rows(2, 5, seed=4, count=1)[0]["seed"] != alone[0]["seed"]
-    assert (sum(row["intervention_rate"] for row in alone) > 0) == projected
+    assert any(row.get("intervention_rate", 0.0) > 0 for row in alone) == projected
 
 
 def test_figures_against_gymnasium_by_hand():
@@ -100,7 +101,7 @@ def test_figures_against_gymnasium_by_hand():
     assert row["return"] == pytest.approx(sum(rewards), rel=1e-5)
     assert row["cost_return"] == pytest.approx(sum(costs), rel=1e-5, abs=1e-7)
     assert row["speed"] == pytest.approx(sum(speeds) / len(speeds), rel=1e-5)
-    assert row["min_distance"] == pytest.approx(min(distances), rel=1e-5)
+    assert row["min_distance"] == pytest.approx(max(min(distances), 0.0), rel=1e-5)
     assert row["route"] == info["route"]
     for key, flag in (
         ("hit_vehicle", "collision"),
@@ -136,7 +137,7 @@ def test_interventions_are_shares_of_decisions():
     plain = evaluate(
         Driver(), BatchedIntersection(ROAD, num_envs=2, seed=0), 2, seed=0, progress=False
     )
-    assert all(row["intervention_rate"] == row["correction"] == 0.0 for row in plain)
+    assert not any("intervention_rate" in row or "correction" in row for row in plain)
 
 
 def test_nothing_after_the_end_counts():
@@ -158,8 +159,8 @@ def test_write(tmp_path: Path):
     )
     figures = write(rows, tmp_path / "new", policy="blind", seed=0)
     stored = json.loads((tmp_path / "new/metrics.json").read_text())
-    assert {key: stored[key] for key in FIGURES} == figures and stored["policy"] == "blind"
-    assert all(0 <= stored[key]["mean"] <= 1 for key in FIGURES if key.endswith("_rate"))
+    assert {key: stored[key] for key in figures} == figures and stored["policy"] == "blind"
+    assert all(0 <= stored[key]["mean"] <= 1 for key in figures if key.endswith("_rate"))
     lines = (tmp_path / "new/episodes.csv").read_text().splitlines()
     assert len(lines) == 4 and lines[0].startswith("episode,seed,route,collision")
     with pytest.raises(ValueError, match="episodes must be >= 1"):
@@ -202,7 +203,7 @@ def test_a_training_ends_beside_the_drivers_that_it_names_and_with_pictures(
         json.loads((tmp_path / name / "metrics.json").read_text())
         for name in ("run/evaluation/blind", "b")
     )
-    assert all(ours[name] == theirs[name] for name in FIGURES)
+    assert all(ours.get(name) == theirs.get(name) for name in FIGURES)
     assert (tmp_path / "run/evaluation/episode_0.gif").is_file()
     assert (tmp_path / "run/evaluation/episode_0.png").is_file()
     text = capsys.readouterr().out.partition("The same 3 episodes of gs")[2]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ import torch
 from tensordict import TensorDict
 
 from saferl.envs.intersection import Scenario
+from saferl.evaluation.compare import cell
 from saferl.evaluation.statistics import FIGURES, mean_interval, summarise, table, wilson
 from saferl.training.records import CsvLog, EpisodeWindow, finished_episodes
 
@@ -29,7 +31,7 @@ def test_mean_interval_by_hand():
     """1, 2, 3, 4: mean 2.5, s = sqrt(5/3), t(0.975, 3) = 3.182446."""
     half = 3.182446305284263 * math.sqrt(5 / 3) / 2
     assert mean_interval([1, 2, 3, 4]) == pytest.approx((2.5 - half, 2.5 + half), abs=1e-9)
-    assert mean_interval([7.0]) == (7.0, 7.0)
+    assert mean_interval([7.0]) == (None, None)
     assert mean_interval([2.0, 2.0]) == (2.0, 2.0)
 
 
@@ -55,6 +57,25 @@ def test_summarise():
         summarise([])
     text = table(figures, "title")
     assert text.startswith("title\n") and "75.00 %" in text
+
+
+def test_an_interval_stays_where_its_figure_can_be():
+    """Neither below 0 for a speed, nor of one episode, nor of a projector that is not there."""
+    rows = [episode(speed=v, cost_return=c) for v, c in ((0.0, 0.0), (0.1, 0.0), (12.0, 2.0))]
+    for row in rows:
+        del row["intervention_rate"]
+    figures = summarise(rows)
+    assert mean_interval([0.0, 0.1, 12.0])[0] < 0 == figures["speed"]["low"]
+    assert figures["cost_return"]["low"] == 0.0 and "intervention_rate" not in figures
+    assert summarise([episode(**{"return": value}) for value in (-9.0, 1.0)])["return"]["low"] < -9
+    single = summarise(rows[:1])
+    assert single["speed"] == {"mean": 0.0, "low": None, "high": None}
+    assert single["success_rate"]["high"] == wilson(0, 1)[1]
+    assert re.search(r"^speed m/s +0.00 +-$", table(single), re.MULTILINE)
+    assert cell([{"episodes": 1, **single}], "speed") == "0 -"
+    assert cell([{"episodes": 3, **figures}, {"episodes": 1, **single}], "speed").startswith(
+        "2.017 [0, "
+    )
 
 
 def collected(done: list[list[bool]]) -> TensorDict:

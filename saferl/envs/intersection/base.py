@@ -158,7 +158,8 @@ class Scenario(Task):
 
     @property
     def title(self) -> str:
-        return f"{self.task}, {self.traffic.vehicles[1]} vehicles"
+        low, high = self.traffic.vehicles
+        return f"{self.task}, {low if low == high else f'{low} to {high}'} vehicles"
 
     def check_policy_of(self, trained: Scenario) -> None:
         if trained.observation != self.observation:
@@ -174,8 +175,8 @@ class Scenario(Task):
         return {"collision": collision, "success": success, "frozen": 1.0 - collision - success}
 
     def figures(self, steps: Sequence[TensorDictBase], counts: Sequence[int]) -> list[dict]:
-        """``hit_vehicle`` and ``left_road`` tell collisions apart; ``speed`` (m/s) and ``min_distance`` (m, to another
-        vehicle) are over the whole episode."""
+        """``hit_vehicle`` and ``left_road`` tell collisions apart; ``speed`` (m/s) and ``min_distance`` (m, between the
+        circles that cover the ego and those of another vehicle, 0 where they overlap) are over the whole episode."""
         ego = torch.stack([step["next", "ego"] for step in steps]).to("cpu", torch.float64)
         speed = torch.hypot(reading(ego, "v_x"), reading(ego, "v_y"))
         distance = reading(ego, "d_veh")
@@ -196,15 +197,16 @@ class Scenario(Task):
                     "hit_vehicle": int(hit),
                     "left_road": int(left),
                     "speed": math.fsum(speed[:count, index].tolist()) / count,
-                    "min_distance": distance[:count, index].min().item(),
+                    "min_distance": max(distance[:count, index].min().item(), 0.0),
                 }
             )
         return rows
 
     def describe(self) -> dict[str, Any]:
+        low, high = self.traffic.vehicles
         return {
             "task": self.task,
-            "vehicles": self.traffic.vehicles[1],
+            "vehicles": low if low == high else [low, high],
             "rows": self.rows,
             "scenario": self.scenario,
             "traffic": dataclasses.asdict(self.traffic),
