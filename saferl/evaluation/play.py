@@ -12,10 +12,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from tqdm import tqdm
 
 from saferl.envs.seeding import episode_seeds
 from saferl.envs.task import Task
+from saferl.evaluation.progress import bar
 from saferl.evaluation.rows import episode_rows
 
 
@@ -84,17 +84,10 @@ def evaluate(
     width, task = env.batch_size[0], cast(Task, env.task)
     seeds = episode_seeds(seed, -(-episodes // width) * width)
     rows: list[dict] = []
-    with tqdm(
-        total=episodes,
-        desc="test",
-        unit="episode",
-        dynamic_ncols=True,
-        mininterval=1.0,
-        disable=not progress,
-    ) as bar:
+    with bar(total=episodes, desc="test", unit="episode", disable=not progress) as shown:
 
         def ended(count: int) -> None:  # the last chunk may hold more episodes than are wanted
-            bar.update(min(count, episodes - bar.n))
+            shown.update(min(count, episodes - shown.n))
 
         for chunk in seeds.split(width):
             rows += episode_rows(play(policy, env, chunk.to(env.device), ended), chunk, task)

@@ -18,10 +18,10 @@ from torch import Tensor
 from torchrl.collectors import Collector
 from torchrl.data import ReplayBuffer
 from torchrl.record.loggers import Logger
-from tqdm import tqdm
 
 from saferl.checkpoint.run import RunCheckpoint
 from saferl.checkpoint.state import CollectorState, Fitting, GrowingFiles
+from saferl.evaluation.progress import bar
 from saferl.training.learner import Learner
 from saferl.training.progress import Budget, Clock, Progress
 from saferl.training.records import CsvLog, EpisodeWindow
@@ -170,17 +170,15 @@ class Trainer:
         """
         progress = self.progress
         by_episode = self.budget.episodes is not None
-        bar = tqdm(
+        shown = bar(
             total=self.budget.whole,
             initial=progress.episodes if by_episode else progress.frames,
             unit="episode" if by_episode else "frame",
             desc="train",
-            dynamic_ncols=True,
-            mininterval=1.0,
             postfix=self.window.short(),
         )
         batches = iter(self.collector)
-        with self._logging(), _interrupts() as interrupted, bar:
+        with self._logging(), _interrupts() as interrupted, shown:
             if progress.last_save < 0:
                 self.experience.prepare()
                 self.save()
@@ -188,8 +186,8 @@ class Trainer:
                 with self.clock.phase("collect"):
                     data = next(batches)
                 if len(self._take(data)):
-                    bar.set_postfix(self.window.short(), refresh=False)
-                bar.update((progress.episodes if by_episode else progress.frames) - bar.n)
+                    shown.set_postfix(self.window.short(), refresh=False)
+                shown.update((progress.episodes if by_episode else progress.frames) - shown.n)
                 if progress.frames - progress.last_record >= self.record_every:
                     self._record()
                 if self._save_is_due() and self.spent < 1.0:

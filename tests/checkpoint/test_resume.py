@@ -160,8 +160,8 @@ def test_progress_is_shown_from_where_it_was(tmp_path: Path, monkeypatch: pytest
 
     import saferl.training.trainer
 
-    real = saferl.training.trainer.tqdm
-    monkeypatch.setattr(saferl.training.trainer, "tqdm", bar)
+    real = saferl.training.trainer.bar
+    monkeypatch.setattr(saferl.training.trainer, "bar", bar)
     restored(tmp_path, *options).train()
     assert shown[0]["initial"] == 10 and shown[0]["total"] == 24
 
