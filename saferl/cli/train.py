@@ -31,7 +31,8 @@ def train(cfg: DictConfig) -> None:
         run = Path(HydraConfig.get().runtime.output_dir)
         complete(cfg.task)
         OmegaConf.resolve(cfg)
-        if HydraConfig.get().mode is RunMode.MULTIRUN and begun(run, cfg):
+        again = HydraConfig.get().mode is RunMode.MULTIRUN and (run / FOLDER).exists()
+        if again and run_config(run) == cfg:  # a sweep that is run again
             if (run / TESTED).exists():
                 log.info("%s is there already.", run)
                 return
@@ -46,7 +47,11 @@ def train(cfg: DictConfig) -> None:
             with closing(build_trainer(cfg, run)) as trainer:
                 if resuming:
                     trainer.resume()
-                    keep(cfg, run)
+                    if cfg != run_config(run):  # a larger budget, of which no test is there yet
+                        (run / TESTED).unlink(missing_ok=True)
+                        part = run / f"{CONFIG}.part"
+                        OmegaConf.save(cfg, part)
+                        part.replace(run / CONFIG)
                 log.info(
                     "%s on %s, seed %d. Files: %s", cfg.algo_name, cfg.task.task, cfg.seed, run
                 )
@@ -129,19 +134,6 @@ def prolonged(own: DictConfig, asked: DictConfig, overrides: Sequence[str]) -> D
             )
         own[budget] = asked[budget]
     return own
-
-
-def keep(cfg: DictConfig, run: Path) -> None:
-    """Write a run's configuration, or leave the one that is there whole."""
-    part = run / f"{CONFIG}.part"
-    OmegaConf.save(cfg, part)
-    part.replace(run / CONFIG)
-
-
-def begun(run: Path, cfg: DictConfig) -> bool:
-    """Whether a folder holds a checkpoint of this very configuration."""
-    there = (run / FOLDER).exists() and (run / CONFIG).exists()
-    return there and run_config(run) == cfg
 
 
 def claim(run: Path, cfg: DictConfig) -> None:
