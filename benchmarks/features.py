@@ -19,7 +19,7 @@ from side_by_side import write
 from time_to_safe import ENDS, Work, carry_out, tests, train
 
 from saferl.envs.intersection.observation import FORMS
-from saferl.evaluation.statistics import mean_interval, span
+from saferl.evaluation.statistics import mean_interval, span, within
 
 BLANK = 1e9
 #: Whose features, and which.
@@ -78,12 +78,13 @@ def main() -> None:
     )
     for group in GROUPS:
         ends = [tests(folders[group, seed])[-1] for seed in options.seeds]
-        rates = figures[group] = {end: [100 * row[end] for row in ends] for end in ENDS}
+        rates = figures[group] = {f"{end}_rate": [row[end] for row in ends] for end in ENDS}
         cells = []
-        for values in rates.values():
-            cells.append(f"{np.mean(values):.1f} {span(*mean_interval(values), '.1f')}")
-        whole = figures["nothing"]["success"]
-        missed = sum(one < all_ for one, all_ in zip(rates["success"], whole, strict=True))
+        for name, values in rates.items():
+            low, high = within(name, mean_interval(values), values)
+            cells.append(f"{100 * np.mean(values):.1f} {span(low, high, '.1f', 100)}")
+        whole = figures["nothing"]["success_rate"]
+        missed = sum(one < all_ for one, all_ in zip(rates["success_rate"], whole, strict=True))
         print(f"| {group} | {' | '.join(cells)} | {missed} of {seeds} |")
     write(options.json, figures)
 

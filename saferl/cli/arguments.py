@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
-from pathlib import Path
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
@@ -14,22 +14,25 @@ PATHS = ("out", "checkpoint", "resume", "init")
 #: Flags of Hydra that are followed by a value.
 _VALUED = ("--config-dir", "-cd", "--config-name", "-cn", "--config-path", "-cp", "--package", "-p")
 _VALUED += ("--cfg", "-c", "--experimental-rerun")
-#: Values that Hydra reads as they are: words that are no number and no truth value, and what is in quotes.
+#: Paths that Hydra reads as they are: words that are no number and no truth value, and what is in quotes.
 _PLAIN = re.compile(
-    r"(?!(?:true|false|nan|inf)$)(?:[a-z_./][\w./-]*)?|(['\"]).*\1", re.ASCII | re.IGNORECASE
+    r"(?!(?:true|false|nan|inf)$)(?:(?:[a-z_/]|\.(?!\d))[\w./-]*)?|(['\"]).*\1",
+    re.ASCII | re.IGNORECASE,
 )
+#: Functions by which a sweep may list paths.
+_LISTING = re.compile(r"(?:choice|glob|shuffle|sort)\(.*\)")
 
 
 def readable(arguments: Sequence[str]) -> list[str]:
     """The arguments in an order and a spelling that Hydra understands.
 
     - Flags may stand anywhere.
-    - A path may hold any character: ``resume=run (1)``, ``out=algo=sac,seed=0``. With ``-m`` a comma parts two paths, unless
-      there is a file of that name.
+    - A path may hold any character: ``resume=run (1)``, ``out=algo=sac,seed=0``. Only ``${...}`` is looked up, and with ``-m`` a
+      comma parts two paths, unless there is a file of that name.
     - A job of ``-m`` is named by the settings in which the jobs differ.
 
-    >>> readable(["seed=0", "-m", "algo=sac,asac", "out=my run"])[:4]
-    ['-m', 'seed=0', 'algo=sac,asac', "out='my run'"]
+    >>> readable(["-m", "seed=0", "algo=sac,asac", "out=my run"])
+    ['seed=0', 'algo=sac,asac', "out='my run'", "hydra.job.config.override_dirname.exclude_keys=['seed','out']", '-m']
     """
     flags: list[str] = []
     settings: list[str] = []
@@ -43,19 +46,27 @@ def readable(arguments: Sequence[str]) -> list[str]:
             settings.append(argument)
     many = any(flag in ("-m", "--multirun") for flag in flags)
     settings = [_quoted(setting, many) for setting in settings]
-    return [*flags, *settings, *(_names(settings) if many else [])]
+    return [*settings, *(_names(settings) if many else []), *flags]
 
 
 def _quoted(setting: str, many: bool) -> str:
     """A setting that is a path, in quotes where Hydra would read something else."""
     key, _, value = setting.partition("=")
-    if key not in PATHS or _PLAIN.fullmatch(value) or "${" in value:
+    if key not in PATHS or "${" in value:
         return setting
-    if many and "," in value and key != "out" and not Path(value).exists():
+    # All jobs of a sweep share ``out``.
+    several = many and key != "out" and not os.path.exists(value)
+    if several and _LISTING.fullmatch(value):
         return setting
-    # A quote is written \', and backslashes are doubled before it and at the end.
-    text = re.sub(r"(\\*)('|$)", lambda found: 2 * found[1] + (found[2] and "\\'"), value)
-    return f"{key}='{text}'"
+    return f"{key}={','.join(map(_in_quotes, value.split(',') if several else [value]))}"
+
+
+def _in_quotes(path: str) -> str:
+    if path == "null" or _PLAIN.fullmatch(path):
+        return path
+    # A quote is written \\', and backslashes are doubled before it and at the end.
+    text = re.sub(r"(\\*)('|$)", lambda found: 2 * found[1] + (found[2] and "\\'"), path)
+    return f"'{text}'"
 
 
 def _names(settings: Sequence[str]) -> list[str]:

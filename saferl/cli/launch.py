@@ -8,6 +8,7 @@ import sys
 import traceback
 from contextlib import suppress
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -18,9 +19,12 @@ from saferl.cli.arguments import PATHS, readable
 from saferl.cli.errors import MISTAKES, explain
 from saferl.config import schema
 from saferl.config.locate import config_dir
-from saferl.evaluation.compare import FAILED, Summary
 
 INTERRUPTED = 130
+#: What a job of a sweep leaves in its folder where it could not run to its end.
+FAILED = "error.txt"
+#: Names the file in which jobs, whatever processes they run in, say that they failed.
+_FAILURES = "SAFERL_FAILURES"
 
 
 def launch(command: str, config: str) -> None:
@@ -39,7 +43,11 @@ def launch(command: str, config: str) -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"
 
     def run(cfg: DictConfig) -> None:
+        folder = Path(HydraConfig.get().runtime.output_dir)
+        many = HydraConfig.get().mode is RunMode.MULTIRUN
         try:
+            if many:  # of an earlier try
+                (folder / FAILED).unlink(missing_ok=True)
             for key in PATHS:
                 if cfg.get(key) == "":
                     raise ValueError(f"{key} must be a path, got ''.")
@@ -48,21 +56,27 @@ def launch(command: str, config: str) -> None:
             # Late: help and most mistakes need no torch.
             getattr(importlib.import_module(f"saferl.cli.{command}"), command)(cfg)
         except BaseException as error:
-            folder = Path(HydraConfig.get().runtime.output_dir)
-            if HydraConfig.get().mode is RunMode.MULTIRUN and isinstance(error, Exception):
-                line = explain(error) if isinstance(error, MISTAKES) else traceback.format_exc()
+            if many and isinstance(error, Exception):
+                told = isinstance(error, MISTAKES) and before != "1"
+                line = explain(error) if told else traceback.format_exc()
                 print(f"error: {line}", file=sys.stderr)
                 (folder / FAILED).write_text(f"{line}\n", encoding="utf-8")
+                with Path(os.environ[_FAILURES]).open("a", encoding="utf-8") as file:
+                    file.write(f"{os.path.relpath(folder)}\n")
                 return
             _drop_if_empty(folder)
             if isinstance(error, MISTAKES) and before != "1":
                 raise SystemExit(f"error: {explain(error)}") from None
             raise
-        else:
-            (Path(HydraConfig.get().runtime.output_dir) / FAILED).unlink(missing_ok=True)
 
     try:
-        hydra.main(version_base="1.3", config_path=config_dir(), config_name=config)(run)()
+        with NamedTemporaryFile("r", encoding="utf-8") as failures:
+            os.environ[_FAILURES] = failures.name
+            hydra.main(version_base="1.3", config_path=config_dir(), config_name=config)(run)()
+            if failed := failures.read().splitlines():
+                raise SystemExit(
+                    f"error: {', '.join(failed)} failed; each says why in its {FAILED}."
+                )
     except BrokenPipeError:  # whoever read our output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except MISTAKES as error:
@@ -74,12 +88,9 @@ def launch(command: str, config: str) -> None:
         raise SystemExit(INTERRUPTED) from None
     finally:
         del os.environ["HYDRA_FULL_ERROR"]
+        os.environ.pop(_FAILURES, None)
         if before is not None:
             os.environ["HYDRA_FULL_ERROR"] = before
-    if Summary.failed:
-        raise SystemExit(
-            f"error: {', '.join(Summary.failed)} failed; each says why in its {FAILED}."
-        )
 
 
 def _drop_if_empty(folder: Path) -> None:

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -31,13 +32,16 @@ def train(cfg: DictConfig) -> None:
         run = Path(HydraConfig.get().runtime.output_dir)
         complete(cfg.task)
         OmegaConf.resolve(cfg)
-        again = HydraConfig.get().mode is RunMode.MULTIRUN and (run / FOLDER).exists()
-        if again and run_config(run) == cfg:  # a sweep that is run again
-            if (run / TESTED).exists():
-                log.info("%s is there already.", run)
-                return
-            resuming = True
-        else:
+        if HydraConfig.get().mode is RunMode.MULTIRUN and (run / CONFIG).exists():
+            if (run / FOLDER).exists():  # a sweep that is run again
+                resuming = composed(run_config(run)) == composed(cfg)
+            else:  # killed before its first checkpoint, if nobody works on it
+                with alone(run, "out"):
+                    (run / CONFIG).unlink()
+        if resuming and (run / TESTED).exists():
+            log.info("%s is there already.", run)
+            return
+        if not resuming:
             claim(run, cfg)
     else:
         run = run_folder(Path(str(cfg.resume)), "resume")
@@ -107,6 +111,16 @@ def closing_test(cfg: DictConfig, run: Path) -> None:
     pictures(
         cfg.env, task, policy, transforms, results[cfg.algo_name][: settings.gif], out, cfg.device
     )
+
+
+#: Settings of where and how a run is made, not of what it is.
+MADE = ("out", "device", "threads", "logger", "save_every", "save_minutes")
+
+
+def composed(cfg: DictConfig) -> Any:
+    """What a run is, whoever makes it where."""
+    kept: Any = OmegaConf.to_container(cfg, resolve=True)
+    return {key: value for key, value in kept.items() if key not in MADE}
 
 
 def prolonged(own: DictConfig, asked: DictConfig, overrides: Sequence[str]) -> DictConfig:

@@ -32,6 +32,19 @@ OmegaConf.register_new_resolver(
 )
 
 
+def job_name(differing: str, number: int) -> str:
+    """The folder of a job of a sweep: what is its own, as one name that stays in the sweep's folder.
+
+    >>> job_name("algo-sac_init-../../a run", 1), job_name("", 0)
+    ('algo-sac_init-.._.._a run', '0')
+    """
+    name = differing.replace("/", "_").replace("\\", "_")
+    return name[:200] if name.strip(".") else str(number)
+
+
+# ${job_name:${hydra.job.override_dirname},${hydra.job.num}}
+OmegaConf.register_new_resolver("job_name", job_name, replace=True)
+
 #: A budget for which compiling pays, which takes minutes.
 LONG = {"episodes": 2_000, "frames": 100_000}
 

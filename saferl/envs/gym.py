@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import importlib
+import sysconfig
 import traceback
 from collections.abc import Mapping
 from contextlib import closing
@@ -191,7 +192,8 @@ class _Placed(gymnasium.Wrapper):
 
     def _fault(self, what: str, error: Exception) -> ValueError:
         frames = traceback.extract_tb(error.__traceback__)
-        own = [frame for frame in frames[1:] if "site-packages" not in frame.filename]
+        libraries = (sysconfig.get_path("stdlib"), sysconfig.get_path("purelib"))
+        own = [frame for frame in frames[1:] if not frame.filename.startswith(libraries)]
         place = (own or frames)[-1]
         return ValueError(
             f"task.id: {self.name} failed in {what}: {type(error).__name__}: {error} "

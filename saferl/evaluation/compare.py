@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
@@ -17,29 +17,15 @@ COLUMNS = ("success_rate", "collision_rate", "return", "cost_return")
 
 #: A run's closing test, once it is over.
 TESTED = "evaluation/metrics.json"
-#: What a job of a sweep leaves in its folder where it could not run to its end.
-FAILED = "error.txt"
 
 
 class Summary(Callback):
-    """Hydra's callback that prints :func:`side_by_side` of all runs of a sweep.
-
-    Attributes:
-        failed: the jobs of the last sweep that did not run to their end, by their folders.
-    """
-
-    failed: ClassVar[list[str]] = []
-
-    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        for path in Path(config.hydra.sweep.dir).glob(f"**/{FAILED}"):  # of an earlier try
-            path.unlink()
+    """Hydra's callback that prints :func:`side_by_side` of all runs of a sweep."""
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        folder = Path(config.hydra.sweep.dir)
-        runs = finished([folder])
+        runs = finished([Path(config.hydra.sweep.dir)])
         if len(runs) > 1:
             print(side_by_side(runs))
-        Summary.failed = sorted(str(path.parent) for path in folder.glob(f"**/{FAILED}"))
 
 
 def finished(folders: Sequence[Path]) -> list[tuple[Mapping, Mapping]]:

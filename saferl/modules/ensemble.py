@@ -259,6 +259,11 @@ class CriticEnsemble(TensorDictModuleBase):
         self.in_keys = list(template.in_keys)
         self.out_keys = [template.out_keys[0]]
 
+    def __copy__(self) -> CriticEnsemble:
+        copy = type(self).__new__(type(self))
+        copy.__dict__.update(self.__dict__)
+        return copy
+
     def __deepcopy__(self, memo: dict[int, Any]) -> CriticEnsemble:
         copy = memo[id(self)] = type(self).__new__(type(self))
         copy.__dict__.update(deepcopy(self.__dict__, memo))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -20,16 +22,20 @@ def _flat(data: TensorDictBase, keys: Sequence[NestedKey]) -> TensorDictBase:
 
 
 def memory(device: torch.device) -> int:
-    """Bytes that a device has in all; on a CPU not more than the process may have, and no end where the system does not say."""
+    """Bytes that a device has in all; on a CPU not more than the process or its container may have, and no end where the
+    system does not say."""
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[1]
     try:
         import resource
     except ImportError:  # not a Unix
         return sys.maxsize
-    allowed = resource.getrlimit(resource.RLIMIT_AS)[0]
-    there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return there if allowed == resource.RLIM_INFINITY else min(there, allowed)
+    there = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+    if (allowed := resource.getrlimit(resource.RLIMIT_AS)[0]) != resource.RLIM_INFINITY:
+        there.append(allowed)
+    with suppress(OSError, ValueError):  # no control group, or one without a limit
+        there.append(int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    return min(there)
 
 
 def check_memory(option: str, count: int, transition: TensorDictBase, device: torch.device) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,7 +20,6 @@ from saferl.algorithms.assemble import build_agent, build_trainer, load_agent
 from saferl.checkpoint.lock import alone
 from saferl.checkpoint.run import CONFIG, run_config
 from saferl.evaluation.compare import main as summarise
-from saferl.training.trainer import _interrupts
 
 TRAIN, TEST, EXPORT = ("train", "config"), ("evaluate", "evaluate"), ("export", "export")
 
@@ -207,86 +205,6 @@ def test_init_of_another_algorithm(run: Path, tmp_path: Path, refusal):
     assert "encoder._target_ is saferl.modules.MLP there and" in line
 
 
-def test_train_from_any_folder_then_multirun(command, tmp_path: Path, capsys):
-    command(*TRAIN, *SMALL, *EMPTY, "algo=sac", "out=mine", "logger=tensorboard")
-    names = {path.name for path in (tmp_path / "mine").iterdir()}
-    assert names == {
-        ".lock", "checkpoints", "config.yaml", "evaluation", "metrics.csv", "tensorboard", "timing.csv",
-    }  # fmt: skip
-    assert {path.name for path in tmp_path.iterdir()} == {"mine"}
-    assert "SR" in capsys.readouterr().out
-
-    command(*TRAIN, "-m", *SMALL, *EMPTY, "algo=sac,asac", "seed=0,1", "frames=8", "out=many")
-    jobs = sorted(path for path in (tmp_path / "many").iterdir() if path.is_dir())
-    assert [job.name for job in jobs] == [
-        f"algo-{algo}_seed-{seed}" for algo in ("asac", "sac") for seed in (0, 1)
-    ]
-    made = [(job / CONFIG).read_text() for job in jobs]
-    assert ["algo_name: sac\n" in text for text in made] == [False, False, True, True]
-    assert [f"seed: {seed}\n" in text for seed, text in zip((0, 1, 0, 1), made, strict=True)] == [
-        True
-    ] * 4
-    assert all((job / "evaluation/metrics.json").is_file() for job in jobs)
-    summary = capsys.readouterr().out.splitlines()[-3:]
-    summarise(["many"])
-    assert capsys.readouterr().out.splitlines() == summary
-    with pytest.raises(SystemExit, match="no run below elsewhere has been tested"):
-        summarise(["elsewhere"])
-    assert summary[0].split() == ["runs", "SR", "%", "CR", "%", "return", "cost", "return"]
-    for line, algo in zip(summary[1:], ("sac", "asac"), strict=True):
-        assert re.match(algo + r" gs +2 +\S+ \[\S+, \S+\]  ", line)
-
-
-def test_one_refused_job_of_a_sweep_stops_no_other(command, tmp_path: Path, capsys):
-    """It is told at the end and by its folder; the same command again does what is missing, and only that."""
-    small = [setting for setting in SMALL if "batch_size" not in setting]
-    many = (*TRAIN, *small, "task=cart", "algo=sac", "seed=0,1", "out=many", "-m")
-    with pytest.raises(SystemExit) as left:
-        command(*many, "learning.batch_size=8,100000")
-    bad = [f"many/learning.batch_size-100000_seed-{seed}" for seed in (0, 1)]
-    good = [tmp_path / name.replace("100000", "8") for name in bad]
-    assert str(left.value).startswith(f"error: {bad[0]}, {bad[1]} failed")
-    assert "got 64 and 100000" in (tmp_path / bad[0] / "error.txt").read_text()
-    assert re.search(r"sac cart +2 ", capsys.readouterr().out)
-
-    rows = [(run / "metrics.csv").read_text() for run in good]
-    (good[1] / "evaluation/metrics.json").unlink()
-    with pytest.raises(SystemExit) as left:
-        command(*many, "learning.batch_size=8,100000,200000")
-    assert str(left.value).count("00000_seed") == 4
-    assert re.search(r"sac cart +2 ", out := capsys.readouterr().out)
-    assert f"{good[0]} is there already" in out and f"{good[1]} is there already" not in out
-    assert rows == [(run / "metrics.csv").read_text() for run in good]
-    command(*many, "learning.batch_size=8,16")
-    assert capsys.readouterr().out.count("sac cart learning.batch_size=") == 2
-    assert not list(tmp_path.glob("many/*/error.txt"))
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "Läufe",
-        "run (1)",
-        "algo=rsac,seed=0",
-        "50%",
-        "a{b}",
-        "it's",
-        "ends\\",
-        "007",
-        "true",
-        "a b#c",
-    ],
-)
-def test_a_path_may_hold_any_character(name: str, command, tmp_path: Path):
-    command(*TRAIN, *SMALL, "task=cart", "algo=sac", "frames=8", f"out={name}")
-    assert (tmp_path / name / "metrics.csv").is_file()
-    command(*TRAIN, f"resume={name}")
-    command(*TEST, f"checkpoint={name}", "episodes=1", f"out={name}/test")
-    command(*TEST, "-m", f"checkpoint={name}", "episodes=1", f"out={name}/tests", "seed=0,1")
-    made = sorted(path.parent.name for path in (tmp_path / name / "tests").glob("*/metrics.json"))
-    assert made == ["seed-0", "seed-1"]
-
-
 def test_run_folder_has_a_name_that_shells_like(command, tmp_path: Path):
     command(*TRAIN, *SMALL, *EMPTY, "algo=sac", "frames=8", "seed=3")
     (folder,) = (tmp_path / "runs").iterdir()
@@ -342,50 +260,6 @@ def test_the_readmes_everyday_commands_work_in_order(command, tmp_path: Path):
             arguments[1] = "frames=32"
         command(name, "config" if name == "train" else name, *arguments)
     assert (tmp_path / "test/metrics.json").is_file() and (tmp_path / "policy").is_dir()
-
-
-def test_interrupt_leaves_a_checkpoint_that_loads(spawn, tmp_path: Path):
-    """Ctrl-C once; exit 130 and a line that says how to go on, which then works."""
-    options = (*SMALL, *EMPTY, "algo=sac", "frames=1000000", "save_every=1000000", "out=run")
-    process = spawn("saferl", *options)
-    metrics = tmp_path / "run/metrics.csv"
-    while not metrics.exists() or metrics.read_text().count("\n") < 3:
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=300)
-    assert process.returncode == 130
-    assert "Traceback" not in err
-    assert "Continue with resume=" in err.splitlines()[-1]
-
-    trainer = build_trainer(compose(*options[:-1]), tmp_path / "run")
-    trainer.resume()
-    assert trainer.progress.updates > 0 and trainer.progress.frames >= 16
-    assert len(trainer.experience.buffer) == min(64, trainer.progress.frames)
-
-
-def test_interrupt_of_the_closing_test_tells_how_to_repeat_it(command, monkeypatch, capsys):
-    def interrupted(*args):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch, pytest.raises(SystemExit) as left:
-        patch.setattr("saferl.cli.evaluate.play_episodes", interrupted)
-        command(*TRAIN, *SMALL, *EMPTY, "algo=sac", "out=run")
-    assert left.value.code == 130
-    line = capsys.readouterr().err.splitlines()[-1]
-    assert line.startswith("Interrupted in the closing test. Repeat it with resume=")
-    command(*TRAIN, line.split()[-1])
-    assert Path("run/evaluation/metrics.json").is_file()
-
-
-def test_second_interrupt_ends_at_once(tmp_path: Path):
-    """Even while a step lasts for ever; then the handler is what it was."""
-    before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt, match="twice"), _interrupts() as received:
-        signal.raise_signal(signal.SIGINT)
-        assert received == [signal.SIGINT]
-        signal.raise_signal(signal.SIGINT)
-    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_mistake_in_a_process_of_its_own(spawn, tmp_path: Path):

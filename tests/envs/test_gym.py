@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import gymnasium
 import numpy as np
 import pytest
@@ -185,3 +187,9 @@ def test_a_fault_of_an_environment_says_where(where: str):
     with pytest.raises(ValueError, match=told):
         GymEnvs(GymTask("test/Engine-v0", kwargs={"fails_in": where}), seed=0)
     assert not Engine.alive
+
+
+def test_a_fault_is_placed_in_its_authors_file_not_in_a_library(monkeypatch):
+    monkeypatch.setattr(Engine, "_fail", lambda self, where: json.loads("{ bad }"))
+    with pytest.raises(ValueError, match=r"JSONDecodeError: .*test_gym.py, line \d+, in <lambda>"):
+        GymEnvs(GymTask("test/Engine-v0"))

@@ -16,6 +16,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.collectors import Collector
 from torchrl.envs import RewardSum, TransformedEnv
+from trainers import collect, trainer_of
 
 from saferl.algorithms import assemble
 from saferl.algorithms.assemble import build_trainer
@@ -29,21 +30,7 @@ from saferl.training.experience import Epochs, Replay
 from saferl.training.learner import Learner
 from saferl.training.progress import Budget
 from saferl.training.records import EpisodeWindow
-from saferl.training.signals import CriticSignal, EpisodeSignal, episode_budget
 from saferl.training.trainer import Trainer
-
-
-def trainer_of(folder: Path, *overrides: str) -> Trainer:
-    return build_trainer(compose(*SMALL, *EMPTY, *overrides), folder)
-
-
-def collect(trainer: Trainer, batches: int) -> list[TensorDict]:
-    """Run the loop's body; returns what was collected."""
-    data, iterator = [], iter(trainer.collector)
-    for _ in range(batches):
-        data.append(next(iterator))
-        trainer._take(data[-1])
-    return data
 
 
 def test_budget():
@@ -87,50 +74,6 @@ def test_demonstrations_fill_the_buffer_before_the_first_frame(tmp_path: Path):
     assert len(stored) == len(shown) + 8 and trainer.progress.frames == 8
     for key in ("action", ("next", "cost"), ("next", "ego")):
         assert torch.equal(stored[key][: len(shown)], shown[key])
-
-
-@pytest.mark.parametrize("algo", ["sac", "arsac", "ppo_lag", "cpo"])
-def test_a_training_that_diverges_stops_and_keeps_its_last_good_checkpoint(algo, tmp_path: Path):
-    """By steps of a size that no network survives."""
-    rates = [f"learning.lr.{name}=[1e30,1e30]" for name in ("actor", "critic")]
-    fresh = algo in ("ppo_lag", "cpo")  # their first update follows their first batch
-    late = () if fresh else ("learning.warmup_frames=40",)
-    cfg = compose(*SMALL, *EMPTY, f"algo={algo}", "frames=400", "save_every=8", *rates, *late)
-    with pytest.raises(ValueError, match=r"at frame \d+: the training diverged.*checkpoint-\d+;"):
-        build_trainer(cfg, tmp_path).train()
-    kept = build_trainer(cfg, tmp_path)
-    kept.resume()
-    assert kept.progress.frames == (0 if fresh else 40)
-    assert all(p.isfinite().all() for p in kept.learner.loss.parameters())
-
-
-def test_nothing_that_is_not_finite_is_kept(tmp_path: Path):
-    """Buffers and sums, too: the checkpoint before stays the newest."""
-    trainer = trainer_of(tmp_path, "algo=rsac", "frames=1000")
-    trainer.save()
-    newest = trainer.checkpoint.rotation.latest()
-    trainer.progress.frames = 8
-    trainer._sums["loss_qvalue"] = torch.tensor(torch.nan)
-    with pytest.raises(ValueError, match="loss_qvalue is not finite at frame 8: .*checkpoint-0"):
-        trainer.save()
-    trainer._sums.clear()
-    trainer.learner.loss.lagrange.value.fill_(torch.inf)
-    with pytest.raises(ValueError, match="lagrange.value is not finite at frame 8: .*checkpoint-0"):
-        trainer.save()
-    assert trainer.checkpoint.rotation.latest() == newest
-
-
-@pytest.mark.parametrize(
-    "task", [("task=gs",), ("task=gs", "env=highway"), ("task=gym", "task.id=Pendulum-v1")]
-)
-def test_an_action_that_is_not_finite_is_the_policys(task: tuple[str, ...], tmp_path: Path):
-    extra = ["task.cost_key=null"] if "task=gym" in task else ["task.vehicles=0"]
-    options = (*SMALL, "algo=sac", *task, *extra, "learning.exploration=0")
-    trainer = build_trainer(compose(*options), tmp_path)
-    next(trainer.learner.loss.actor_network_params.values(True, True)).data.fill_(torch.nan)
-    trainer.collector.init_random_frames = 0
-    with pytest.raises(ValueError, match="policy.*action.* not finite"):
-        collect(trainer, 1)
 
 
 def test_the_papers_order_with_and_without_a_temperature(tmp_path: Path):
@@ -301,49 +244,6 @@ def test_an_end_on_the_last_step_does_not_bootstrap(late: int):
         float(data["next", "reward"][: last + 1].sum()), rel=1e-5
     )
     assert data["episode_reward"][last + 1] == 0
-
-
-def test_episode_signal_uses_each_fresh_episode_once(tmp_path: Path):
-    """Not a stale mean at every gradient step (docs/pitfalls.md, 5), nothing where none ended (docs/pitfalls.md, 10)."""
-    trainer = trainer_of(
-        tmp_path,
-        "algo=sac_lag",
-        "task.duration=1",
-        "task.cost.crash=0",
-        "frames=200",
-        "lagrange.multiplier.lr=0.1",
-    )
-    seen: list[list[float]] = []
-    lagrange = trainer.learner.loss.lagrange
-    update = lagrange.update
-    lagrange.update = lambda violation: (seen.append(violation.tolist()), update(violation))
-    data = collect(trainer, 12)
-    limit = episode_budget(0.05, 0.99, horizon=5)
-    ended = [each["next", "episode_cost"][each["next", "done"]] for each in data]
-    expected = [(costs - limit).tolist() for costs in ended if len(costs)]
-    assert seen == [pytest.approx(costs) for costs in expected] and len(data) > len(seen) >= 2
-    assert trainer.progress.updates > len(seen)
-    # Rounds of plain signed ascent on costs of 0 (an empty road).
-    assert float(lagrange.value) == pytest.approx(1.0 - len(seen) * 0.1 * limit)
-
-
-def test_signals_refuse_a_loss_without_multiplier(tmp_path: Path):
-    trainer = trainer_of(tmp_path, "algo=sac")
-    for signal in (CriticSignal(), EpisodeSignal(0.1)):
-        with pytest.raises(ValueError, match="needs a loss with a multiplier"):
-            signal.register(trainer)
-    with pytest.raises(ValueError, match=r"cost_limit must be >= 0, got -1"):
-        EpisodeSignal(-1)
-
-
-def test_critic_signal_ascends_with_every_update(tmp_path: Path):
-    trainer = trainer_of(tmp_path, "algo=arsac", "lagrange.multiplier.lr=0.5", "cost_limit=0")
-    collect(trainer, 3)
-    value = float(trainer.learner.loss.lagrange.value)
-    losses = trainer.learner.update(trainer.experience.buffer.sample())
-    assert float(trainer.learner.loss.lagrange.value) == pytest.approx(
-        value + 0.5 * float(losses["constraint_violation"]), rel=1e-6
-    )
 
 
 def test_records(tmp_path: Path):
