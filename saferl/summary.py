@@ -1,8 +1,6 @@
 """Closing tests side by side: ``python -m saferl.summary multirun runs/arsac-gs-seed0``."""
 
-import sys
-
 from saferl.evaluation.compare import main
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

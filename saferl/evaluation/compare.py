@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import json
+import os
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -134,12 +137,18 @@ def cell(tests: Sequence[Mapping[str, Any]], name: str) -> str:
     return f"{100 * mean:.1f} {span(low, high, '.1f', 100)}"
 
 
-def main(folders: list[str]) -> None:
+def main(arguments: list[str] | None = None) -> None:
     """Print the table of all runs below these folders."""
-    runs = finished([Path(folder) for folder in folders])
+    parser = argparse.ArgumentParser("python -m saferl.summary", description=__doc__)
+    parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="runs lie below it")
+    folders = parser.parse_args(arguments).folders
+    runs = finished(folders)
     if not runs:
         raise SystemExit(
-            f"error: no run below {', '.join(folders) or 'no folder'} has been tested: give folders of runs, "
+            f"error: no run below {', '.join(map(str, folders))} has been tested: give folders of runs, "
             "as python -m saferl.summary multirun runs."
         )
-    print(side_by_side(runs))
+    try:
+        print(side_by_side(runs), flush=True)
+    except BrokenPipeError:  # whoever read our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

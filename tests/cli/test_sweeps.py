@@ -40,6 +40,9 @@ def test_train_from_any_folder_then_multirun(command, tmp_path: Path, capsys):
     assert capsys.readouterr().out.splitlines() == summary
     with pytest.raises(SystemExit, match="no run below elsewhere has been tested"):
         summarise(["elsewhere"])
+    with pytest.raises(SystemExit) as left:
+        summarise(["--help"])
+    assert left.value.code == 0 and "FOLDER" in capsys.readouterr().out
     assert summary[0].split() == ["runs", "SR", "%", "CR", "%", "return", "cost", "return"]
     for line, algo in zip(summary[1:], ("sac", "asac"), strict=True):
         assert re.match(algo + r" gs +2 +\S+ \[\S+, \S+\]  ", line)
