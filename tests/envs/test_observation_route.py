@@ -26,14 +26,6 @@ from saferl.envs.intersection.observation import (
     reading,
 )
 
-RADIUS = math.sqrt(1.25**2 + 1.0**2)
-TARGETS = {
-    "lt": [(-40, -2), (-40, -6)],
-    "gs_inner": [(2, -40), (6, -40)],
-    "gs_outer": [(2, -40), (6, -40)],
-    "rt": [(40, 2), (40, 6)],
-}
-
 
 def folded(angle):
     return math.atan2(math.sin(angle), math.cos(angle))
