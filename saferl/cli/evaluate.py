@@ -14,7 +14,6 @@ from typing import Any
 import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.transforms import Transform
@@ -22,6 +21,7 @@ from torchrl.envs.transforms import Transform
 from saferl.algorithms.assemble import build_env, load_agent
 from saferl.algorithms.parts import device_of, offered
 from saferl.checkpoint.run import progress, run_config
+from saferl.cli.launch import job_folder
 from saferl.config.check import check_targets
 from saferl.config.locate import pretrained_run
 from saferl.envs.task import Task
@@ -61,9 +61,7 @@ def evaluate(cfg: DictConfig) -> None:
         raise ValueError(f"gif must be 0, as task={task.task} draws no pictures, got {cfg.gif}.")
     title = f"{name.partition(' ')[0]}-{task.task}-seed{cfg.seed}"
     folder = f"evaluation/{title}/{datetime.now():%Y-%m-%d_%H-%M-%S-%f}"
-    out = Path(folder if cfg.out is None else str(cfg.out))
-    if HydraConfig.get().mode is RunMode.MULTIRUN:  # one folder a job
-        out = Path(HydraConfig.get().runtime.output_dir)
+    out = job_folder() or Path(folder if cfg.out is None else str(cfg.out))
     if (out / "metrics.json").exists():
         raise ValueError(f"out: {out} holds a test already; take another folder.")
     rows = measure(

@@ -27,6 +27,12 @@ FAILED = "error.txt"
 _FAILURES = "SAFERL_FAILURES"
 
 
+def job_folder() -> Path | None:
+    """The folder of this job of a sweep (``-m``); None where the command is the only one."""
+    job = HydraConfig.get()
+    return Path(job.runtime.output_dir) if job.mode is RunMode.MULTIRUN else None
+
+
 def launch(command: str, config: str) -> None:
     """Run the command ``saferl.cli.COMMAND`` on the configuration that ``sys.argv`` describes.
 

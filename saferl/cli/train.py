@@ -10,7 +10,6 @@ from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.transforms import Transform
@@ -19,6 +18,7 @@ from saferl.algorithms.assemble import build_trainer, complete
 from saferl.checkpoint.lock import alone
 from saferl.checkpoint.run import CONFIG, FOLDER, run_config, run_folder
 from saferl.cli.evaluate import compiling, measure, pictures, trained_policy
+from saferl.cli.launch import job_folder
 from saferl.evaluation.compare import TESTED, side_by_side
 from saferl.evaluation.statistics import FIGURES, summarise
 
@@ -32,7 +32,7 @@ def train(cfg: DictConfig) -> None:
         run = Path(HydraConfig.get().runtime.output_dir)
         complete(cfg.task)
         OmegaConf.resolve(cfg)
-        if HydraConfig.get().mode is RunMode.MULTIRUN and (run / CONFIG).exists():
+        if job_folder() and (run / CONFIG).exists():
             if (run / FOLDER).exists():  # a sweep that is run again
                 resuming = composed(run_config(run)) == composed(cfg)
             else:  # killed before its first checkpoint, if nobody works on it
