@@ -47,8 +47,8 @@ def calibrate(run: Path, episodes: int, frequency: int) -> dict[str, float]:
         "decisions": len(q),
         "mean_value": q.mean().item(),
         "mean_return": g.mean().item(),
-        "value_above_limit": (q > cfg.cost_limit).float().mean().item(),
-        "return_above_limit": (g > cfg.cost_limit).float().mean().item(),
+        "value_above_limit": (q > cfg.risk_limit).float().mean().item(),
+        "return_above_limit": (g > cfg.risk_limit).float().mean().item(),
         "correlation": torch.corrcoef(torch.stack([q, g]))[0, 1].item(),
     }
 

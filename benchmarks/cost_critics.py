@@ -100,8 +100,8 @@ def main() -> None:
                     "mean_value": q.mean().item(),
                     "mean_return": truth.mean().item(),
                     "rmse": (q - truth).square().mean().sqrt().item(),
-                    "value_above_limit": (q > cfg.cost_limit).float().mean().item(),
-                    "return_above_limit": (truth > cfg.cost_limit).float().mean().item(),
+                    "value_above_limit": (q > cfg.risk_limit).float().mean().item(),
+                    "return_above_limit": (truth > cfg.risk_limit).float().mean().item(),
                     "correlation": torch.corrcoef(torch.stack([q, truth]))[0, 1].item(),
                 }
                 results[f"{target} {update}"] = figures

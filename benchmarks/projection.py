@@ -1,7 +1,7 @@
 """What a correction does to real transitions, for several lambda_a.
 
 Takes the replay buffer and the cost critics of a trained run, and projects the policy's own proposals
-in the states where they are risky (Q_c > cost_limit). For each lambda_a, printed over these states: how
+in the states where they are risky (Q_c > risk_limit). For each lambda_a, printed over these states: how
 often the limit is reached, how far the action moves, Q_c, and what the physics says that the critics do
 not know: the cost of Algorithm 2 (rebuilt from the observation), and whether the ego, holding the action
 for one second, leaves the road.
@@ -72,19 +72,19 @@ def main() -> None:
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         data = agent.actor(data)
         risk = agent.loss.cost_value(data.copy())["state_action_cost_value"].squeeze(-1)
-    risky = data[risk > cfg.cost_limit]
+    risky = data[risk > cfg.risk_limit]
     print(
-        f"{len(risky)} of {len(data)} states are risky (Q_c > {cfg.cost_limit}) under the mean action."
+        f"{len(risky)} of {len(data)} states are risky (Q_c > {cfg.risk_limit}) under the mean action."
     )
     if not len(risky):
         return
     scene = TensorDict({key: risky[key] for key in ("ego", "vehicles", "action")}, risky.batch_size)
     cost, left = physics(scene["ego"], scene["vehicles"], scene["action"])
     rows = {"none": {"feasible": 0.0, "moved": 0.0, "acceleration": 0.0, "steering": 0.0,
-                     "risk": risk[risk > cfg.cost_limit].mean().item(), "cost": cost, "leaves_road": left}}  # fmt: skip
+                     "risk": risk[risk > cfg.risk_limit].mean().item(), "cost": cost, "leaves_road": left}}  # fmt: skip
     bound = agent.loss.cost_value.bind(scene)
     for penalty in args.penalties:
-        result = project(bound, scene["action"], cfg.cost_limit, penalty=penalty)
+        result = project(bound, scene["action"], cfg.risk_limit, penalty=penalty)
         shift = (result.action - scene["action"]).detach()
         cost, left = physics(scene["ego"], scene["vehicles"], result.action)
         rows[f"{penalty:g}"] = {

@@ -76,7 +76,7 @@ class StraightSACLag:
         rows: M, the number of vehicle rows.
         gamma: discount of reward and cost.
         tau: step of the soft target update.
-        cost_limit: d, the bound on the cost critics' value.
+        risk_limit: d, the bound on the cost critics' value.
         compile: compile the losses of the critics and of the actor, which is faster than to compile
             ``update``: that breaks at every ``zero_grad``, ``backward`` and fused ``step``.
         tuned: freeze the critics in the actor's step and learn the temperature from its sample.
@@ -89,12 +89,12 @@ class StraightSACLag:
         rows: int = 11,
         gamma: float = 0.99,
         tau: float = 0.005,
-        cost_limit: float = 0.05,
+        risk_limit: float = 0.05,
         compile: bool = False,
         tuned: bool = False,
     ):
         self.tuned = tuned
-        self.gamma, self.tau, self.cost_limit = gamma, tau, cost_limit
+        self.gamma, self.tau, self.risk_limit = gamma, tau, risk_limit
         self.scale = torch.tensor(EGO_SCALE + rows * VEHICLE_SCALE)
 
         self.actor = Actor(width, rows)
@@ -154,7 +154,7 @@ class StraightSACLag:
         action, log_prob = self.actor.sample(obs, noise)
         q = torch.min(self.qf1(obs, action), self.qf2(obs, action))
         c = torch.max(self.cf1(obs, action), self.cf2(obs, action))
-        violation = F.relu(c - self.cost_limit)
+        violation = F.relu(c - self.risk_limit)
         loss = (alpha * log_prob - q + multiplier * violation).mean()
         return loss, log_prob.detach(), violation.detach().mean()
 

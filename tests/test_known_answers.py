@@ -71,7 +71,7 @@ def test_cart(algo: str, seed: int, tmp_path: Path):
 
 TABLE = (
     "encoder=mlp", "task=cart", "~task.spread", "~task.noise", "task._target_=table.Table", "task.task=table",
-    "task.horizon=10", "env._target_=table.TableEnv", "env.num_envs=64", "cost_limit=1",
+    "task.horizon=10", "env._target_=table.TableEnv", "env.num_envs=64", "risk_limit=1",
     "gamma=0.8", "learning.tau=0.005", "frames=200000", "learning.updates_per_frame=0.04", "encoder.width=32",
     "encoder.depth=2", "learning.reward_scale=1", "learning.target_entropy=-3", "compile=false",
     "projector.penalty=10", "projector.step_size=0.005", "lagrange.multiplier.lr=0.003",

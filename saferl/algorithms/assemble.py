@@ -21,6 +21,7 @@ from saferl.checkpoint.state import Fitting, Networks
 from saferl.config.check import arguments, check, check_targets, check_task
 from saferl.envs.task import Task
 from saferl.training.experience import check_memory
+from saferl.training.limit import CostWatch
 from saferl.training.progress import Budget
 from saferl.training.records import EpisodeWindow
 from saferl.training.signals import ProjectorProgress
@@ -194,6 +195,7 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         experience=experience,
         learner=learner,
         window=EpisodeWindow(parts.task.outcomes),
+        watch=CostWatch(cfg.cost_limit),
         budget=Budget(cfg.episodes, cfg.frames),
         record_every=cfg.record_every,
         save_every=cfg.save_every,

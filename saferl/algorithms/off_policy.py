@@ -39,7 +39,7 @@ class OffPolicy(OffPolicyLearning, Algorithm):
         return {
             "qvalue_network": lambda: networks.action_values(critic, "state_action_value"),
             "cost_critic": networks.risk_critics,
-            "target_entropy": lambda: self.target_entropy,
+            "target_entropy": lambda: self.target_entropy * networks.parts.task.action_dim,
             "alpha_init": lambda: self.alpha_init,
         }
 

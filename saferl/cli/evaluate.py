@@ -221,7 +221,8 @@ def measure(
         seed=seed,
         **about,
     )
-    log.info("\n%s", table(figures, f"{policy_name}: {episodes} episodes of {task.title}"))
+    title = f"{policy_name}: {episodes} episodes of {task.title}"
+    log.info("\n%s", table(figures, title, about.get("cost_limit")))
     if latencies:  # in a file of its own: the others are the same each time
         took = {"median": statistics.median(latencies), "longest": max(latencies)}
         timing = {name: round(1e3 * seconds, 3) for name, seconds in took.items()}

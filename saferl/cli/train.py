@@ -19,6 +19,7 @@ from saferl.checkpoint.lock import alone
 from saferl.checkpoint.run import CONFIG, FOLDER, run_config, run_folder
 from saferl.cli.evaluate import compiling, measure, pictures, trained_policy
 from saferl.cli.launch import job_folder
+from saferl.config.limits import check_limits
 from saferl.evaluation.compare import TESTED, side_by_side
 from saferl.evaluation.statistics import FIGURES, summarise
 
@@ -31,6 +32,7 @@ def train(cfg: DictConfig) -> None:
     if not resuming:
         run = Path(HydraConfig.get().runtime.output_dir)
         complete(cfg.task)
+        check_limits(cfg, HydraConfig.get().overrides.task)
         OmegaConf.resolve(cfg)
         if job_folder() and (run / CONFIG).exists():
             if (run / FOLDER).exists():  # a sweep that is run again

@@ -8,7 +8,6 @@ import sys
 import sysconfig
 from pathlib import Path
 
-import hydra
 from omegaconf import OmegaConf
 
 # ${first:a,b} in a configuration is the first of its arguments that is not null.
@@ -23,12 +22,6 @@ OmegaConf.register_new_resolver(
 # ${unless:a,b} is b where a is null, else null.
 OmegaConf.register_new_resolver(
     "unless", lambda given, value: value if given is None else None, replace=True
-)
-# ${decisions:${task}}: how many an episode has at most.
-OmegaConf.register_new_resolver(
-    "decisions",
-    lambda task: hydra.utils.instantiate(task).horizon,
-    replace=True,
 )
 
 

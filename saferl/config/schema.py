@@ -108,7 +108,7 @@ class OffPolicyLearning(Learning):
     updates_per_frame: float = MISSING
     update_order: str = MISSING
     tau: float = MISSING
-    target_entropy: Any = MISSING
+    target_entropy: float = MISSING
     alpha_init: float = MISSING
     exploration: float = MISSING
     exploration_hold: int = MISSING
@@ -122,13 +122,8 @@ class OffPolicyLearning(Learning):
         above(0, self, "updates_per_frame", "alpha_init", "tau", prefix=prefix)
         share(self, "tau", "exploration", prefix=prefix)
         one_of(ORDERS, self, "update_order", prefix=prefix)
-        number = isinstance(self.target_entropy, (int, float)) and math.isfinite(
-            self.target_entropy
-        )
-        if isinstance(self.target_entropy, bool) or not (number or self.target_entropy == "auto"):
-            raise ValueError(
-                f"learning.target_entropy must be auto or a number, got {self.target_entropy!r}."
-            )
+        if not math.isfinite(self.target_entropy):
+            raise ValueError(f"learning.target_entropy must be finite, got {self.target_entropy}.")
         for name in ("batch_size", "demonstrations"):
             if self.buffer_size < getattr(self, name):
                 raise ValueError(
@@ -223,7 +218,8 @@ class Training:
     episodes: int | None = MISSING
     frames: int | None = MISSING
     gamma: float = MISSING
-    cost_limit: float = MISSING
+    cost_limit: float | None = MISSING
+    risk_limit: float | None = MISSING
     record_every: int = MISSING
     save_every: int = MISSING
     save_minutes: float | None = MISSING
@@ -237,7 +233,7 @@ class Training:
         at_least(0, self.cost_critic, "members", prefix="cost_critic.")
         at_least(1, self.cost_critic, "outputs", prefix="cost_critic.")
         seeded(self)
-        at_least(0, self, "cost_limit")
+        at_least(0, self, "cost_limit", "risk_limit")
         at_least(1, self, "threads", "episodes", "frames", "record_every", "save_every")
         above(0, self, "save_minutes")
         share(self, "gamma")

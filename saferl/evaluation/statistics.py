@@ -103,15 +103,38 @@ def summarise(rows: Sequence[dict[str, float]]) -> dict[str, dict[str, float | N
     return figures
 
 
-def table(figures: dict[str, dict[str, Any]], title: str = "") -> str:
-    """A plain-text table of :func:`summarise`'s figures; rates in percent."""
+def verdict(mean: float, low: float | None, cost_limit: float) -> str:
+    """Whether a mean cost keeps its limit, as far as its interval tells.
+
+    >>> verdict(4.9, 4.5, 5), verdict(5.2, 4.9, 5), verdict(5.2, None, 5), verdict(5.3, 5.1, 5)
+    ('cost_limit=5 is kept', 'cost_limit=5 is kept within chance', 'cost_limit=5 is passed', 'cost_limit=5 is broken')
+    """
+    if mean <= cost_limit:
+        word = "kept"
+    elif low is None:
+        word = "passed"
+    else:
+        word = "broken" if low > cost_limit else "kept within chance"
+    return f"cost_limit={cost_limit:g} is {word}"
+
+
+def table(
+    figures: dict[str, dict[str, Any]], title: str = "", cost_limit: float | None = None
+) -> str:
+    """A plain-text table of :func:`summarise`'s figures; rates in percent, the cost judged by its limit.
+
+    >>> print(table({"cost_return": {"mean": 33.4, "low": 32.1, "high": 34.7}}, cost_limit=30))
+                        mean   95% interval
+    cost return        33.40   [32.10, 34.70]   cost_limit=30 is broken
+    """
     lines = [title] if title else []
     lines.append(f"{'':<14}{'mean':>10}   95% interval")
     for name, value in figures.items():
         short, scale = FIGURES[name][0], 100.0 if name.endswith("_rate") else 1.0
         unit = " %" if scale == 100.0 else ""
         interval = span(value["low"], value["high"], ".2f", scale)
-        lines.append(
-            f"{short:<14}{value['mean'] * scale:>10.2f}{unit:<2} {interval}{unit * (interval != '-')}"
-        )
+        line = f"{short:<14}{value['mean'] * scale:>10.2f}{unit:<2} {interval}{unit * (interval != '-')}"
+        if name == "cost_return" and cost_limit is not None:
+            line += f"   {verdict(value['mean'], value['low'], cost_limit)}"
+        lines.append(line)
     return "\n".join(lines)

@@ -16,6 +16,10 @@ def _check(name: str, value: float, *, positive: bool = False) -> float:
     return float(value)
 
 
+#: Below this an exponential multiplier does not fall, or it would be long in coming back.
+LEAST = 1e-6
+
+
 class LagrangeMultiplier(nn.Module):
     """A multiplier lambda >= 0 of a constraint ``violation <= 0``: fixed, unless a subclass moves it.
 
@@ -67,13 +71,17 @@ class LagrangeMultiplier(nn.Module):
         total = torch.where(finite, penalty, 0.0).sum()
         return total / finite.sum().clamp(min=1), finite.any()
 
-    def update(self, penalty: Tensor) -> None:
+    def update(self, penalty: Tensor, elapsed: float = 1.0) -> None:
         """Moves the multiplier by penalties of any shape, which are averaged; here, not at all.
 
         A loss reports theirs as ``"constraint_violation"``; for violations of your own,
         ``multiplier.update(multiplier.penalty(violation))``. Entries that are not finite are left
         out; with none left (or an empty tensor) nothing changes, so one bad batch cannot turn the
         multiplier into NaN.
+
+        Args:
+            penalty: of any shape.
+            elapsed: since the last update, in the unit of time that rates are of.
         """
 
 
@@ -85,7 +93,7 @@ class DualAscent(LagrangeMultiplier):
 
     Args:
         init: first value.
-        lr: step size alpha_lambda.
+        lr: step size alpha_lambda, for each unit of time.
         signed: whether satisfied samples lower the multiplier.
         maximum: upper bound of the value.
 
@@ -112,32 +120,38 @@ class DualAscent(LagrangeMultiplier):
         self.lr = _check("lr", lr, positive=True)
 
     @torch.no_grad()
-    def update(self, penalty: Tensor) -> None:
+    def update(self, penalty: Tensor, elapsed: float = 1.0) -> None:
         mean, _ = self._mean(penalty)
-        self.value.copy_((self.value + self.lr * mean).clamp(0.0, self.maximum))
+        self.value.copy_((self.value + self.lr * elapsed * mean).clamp(0.0, self.maximum))
 
 
 class PIDMultiplier(LagrangeMultiplier):
     """PID control of the multiplier (Stooke, Achiam and Abbeel, 2020, Algorithm 2).
 
-    With e the mean penalty, which is the mean violation if ``signed``, and e' the one before it:
-    I <- clip(I + ki * e, 0, maximum), lambda <- clip(kp * e + I + kd * max(0, e - e'), 0, maximum).
+    With e the mean penalty, which is the mean violation if ``signed``, e_s the same smoothed, and e' the e_s before:
+    I <- clip(I + ki * e, 0, maximum), lambda <- clip(kp * e_s + I + kd * max(0, e_s - e'), 0, maximum).
 
-    The integral is kept in units of lambda and clipped at every step (anti-windup), so that it lets
-    go as soon as the sign of the violation changes. It starts at ``init``. The derivative acts on
+    If ``exponential`` (ours), what is controlled is log(lambda): I, which begins at log(init), and the sum are clipped
+    between log(1e-6) and log(maximum). A step is then relative, and the same gains serve rewards and costs of any
+    size.
+
+    The integral is kept in units of lambda (or of its logarithm) and clipped at every step (anti-windup), so that it
+    lets go as soon as the sign of the violation changes. It starts at ``init``. The derivative acts on
     rising violations only, and not at the first update.
 
     Args:
         kp: gain on the violation.
-        ki: gain on its running sum.
+        ki: gain on its running sum, for each unit of time.
         kd: gain on its increase since the last update.
         init: first value.
         signed: whether satisfied samples lower the multiplier; Stooke et al. do so.
         maximum: upper bound of the value and of the integral.
+        smoothing: time over which e_s averages e; 0: not at all.
+        exponential: see above.
 
     Raises:
-        ValueError: if a gain or ``init`` is negative or not finite, all gains are 0, or
-            ``maximum < init``.
+        ValueError: if a gain, ``init`` or ``smoothing`` is negative or not finite, all gains are 0,
+            ``maximum < init``, or ``init`` is below 1e-6 and ``exponential``.
 
     Examples:
         >>> import torch
@@ -161,22 +175,34 @@ class PIDMultiplier(LagrangeMultiplier):
         init: float = 0.0,
         signed: bool = True,
         maximum: float = math.inf,
+        smoothing: float = 0.0,
+        exponential: bool = False,
     ):
         super().__init__(init, signed, maximum)
         self.kp, self.ki, self.kd = _check("kp", kp), _check("ki", ki), _check("kd", kd)
         if self.kp == self.ki == self.kd == 0:
             raise ValueError("At least one of kp, ki and kd must be > 0, got 0, 0 and 0.")
-        self.register_buffer("integral", self.value.clone())
+        if exponential and init < LEAST:
+            raise ValueError(f"init must be >= {LEAST} where exponential, got {init}.")
+        self.smoothing, self.exponential = _check("smoothing", smoothing), exponential
+        self.register_buffer("integral", self.value.log() if exponential else self.value.clone())
         self.register_buffer("previous", torch.zeros_like(self.value))
         self.register_buffer("started", torch.tensor(False))
 
     @torch.no_grad()
-    def update(self, penalty: Tensor) -> None:
+    def update(self, penalty: Tensor, elapsed: float = 1.0) -> None:
         mean, known = self._mean(penalty)
-        rise = torch.where(self.started, F.relu(mean - self.previous), 0.0)
-        integral = (self.integral + self.ki * mean).clamp(0.0, self.maximum)
-        value = (self.kp * mean + integral + self.kd * rise).clamp(0.0, self.maximum)
+        weight = -math.expm1(-elapsed / self.smoothing) if self.smoothing else 1.0
+        smooth = torch.where(self.started, self.previous + weight * (mean - self.previous), mean)
+        rise = torch.where(self.started, F.relu(smooth - self.previous), 0.0)
+        least, most = 0.0, self.maximum
+        if self.exponential:
+            least, most = math.log(LEAST), math.log(most)
+        integral = (self.integral + self.ki * elapsed * mean).clamp(least, most)
+        value = (self.kp * smooth + integral + self.kd * rise).clamp(least, most)
+        if self.exponential:
+            value = value.exp()
         self.integral.copy_(torch.where(known, integral, self.integral))
         self.value.copy_(torch.where(known, value, self.value))
-        self.previous.copy_(torch.where(known, mean, self.previous))
+        self.previous.copy_(torch.where(known, smooth, self.previous))
         self.started.logical_or_(known)

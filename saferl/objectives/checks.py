@@ -22,15 +22,15 @@ def check_choice(name: str, value: Any, choices: Any) -> Any:
     return value
 
 
-def check_limit(cost_limit: float) -> float:
+def check_limit(name: str, limit: float) -> float:
     """A limit on costs, in their unit.
 
     Raises:
-        ValueError: it is negative or not finite.
+        ValueError: it is negative or not finite; names it.
     """
-    if not (math.isfinite(cost_limit) and cost_limit >= 0):
-        raise ValueError(f"cost_limit must be >= 0, got {cost_limit}.")
-    return float(cost_limit)
+    if not (math.isfinite(limit) and limit >= 0):
+        raise ValueError(f"{name} must be >= 0, got {limit}.")
+    return float(limit)
 
 
 def check_gamma(hyperparams: dict[str, Any]) -> None:

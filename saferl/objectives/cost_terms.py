@@ -97,7 +97,7 @@ class CostCriticMixin(LossMixin):
     cost_critic_params: TensorDictParams
     target_cost_critic_params: TensorDictParams
     lagrange: LagrangeMultiplier
-    cost_limit: Tensor
+    risk_limit: Tensor
     cost_target: CostTarget
     cost_backup: CostBackup
     risk: Callable[[Tensor], Tensor]
@@ -114,7 +114,7 @@ class CostCriticMixin(LossMixin):
         num_cost_critics: int | None,
         *,
         lagrange: LagrangeMultiplier,
-        cost_limit: float,
+        risk_limit: float,
         cost_target: CostTarget,
         cost_backup: CostBackup,
         risk: Callable[[Tensor], Tensor] | None,
@@ -122,7 +122,7 @@ class CostCriticMixin(LossMixin):
         compare_against: list[nn.Parameter] | None,
     ) -> None:
         """Take the cost critics in, with what their loss and the actor's need, and make the estimators."""
-        cost_limit = check_limit(cost_limit)
+        risk_limit = check_limit("risk_limit", risk_limit)
         self.num_cost_critics = count_members(
             "cost_critic", cost_critic, "num_cost_critics", num_cost_critics
         )
@@ -141,7 +141,7 @@ class CostCriticMixin(LossMixin):
                 f"risk must be a function, such as saferl.modules.Largest(), got {risk!r}."
             )
         self.lagrange = check_lagrange(lagrange)
-        self.register_coeff_buffer("cost_limit", cost_limit, device=self.buffer_device)
+        self.register_coeff_buffer("risk_limit", risk_limit, device=self.buffer_device)
         # Asked for now, so that a fresh loss loads a state_dict strictly.
         _ = self.value_estimator
 

@@ -38,13 +38,13 @@ class CPOLoss(CostValueMixin, PPOLoss):
     .. math::
 
         L_V &= E[(V(s) - G)^2], \quad L_c = E[\tfrac12 (V_c(s) - G_c)^2] \\
-        \max_x\; & g^T x \quad \text{such that} \quad (J_c - d) / w + b^T x \le 0, \quad
+        \max_x\; & g^T x \quad \text{such that} \quad (J_c - d) / L + b^T x \le 0, \quad
         \tfrac12 x^T H x \le \delta
 
     with :math:`G` and :math:`G_c` the value targets, TD(lambda). The first line is :meth:`forward`, for mini-batches. The
     second is :class:`~saferl.objectives.TrustRegionStep`, once for each whole batch, after :meth:`begin`:
     ``loss.policy_step().step(data)``. The loss has what it needs: :meth:`policy`, :meth:`surrogates` (whose gradients
-    are g and b), :meth:`cost_of_policy` (:math:`J_c` and :math:`w`) and the settings.
+    are g and b), :meth:`cost_of_policy` (:math:`J_c` and :math:`L`) and the settings.
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): the policy.
@@ -52,7 +52,7 @@ class CPOLoss(CostValueMixin, PPOLoss):
         cost_critic (TensorDictModule): V_c(s).
 
     Keyword Args:
-        cost_limit (float, optional): d, a bound on the discounted cost of an episode, in its unit. Defaults to ``0.05``.
+        cost_limit (float, optional): d, a bound on the mean cost of an episode, undiscounted. Defaults to ``0.05``.
         trust (float, optional): delta, on the mean KL. Defaults to ``0.01``.
         cg_steps (int, optional): conjugate-gradient iterations. Defaults to ``15``.
         damping (float, optional): added to H's diagonal. Defaults to ``0.1``.
@@ -146,7 +146,8 @@ class CPOLoss(CostValueMixin, PPOLoss):
         )
         self.add_cost_value(cost_critic)
         device = self.buffer_device
-        self.register_coeff_buffer("cost_limit", check_limit(cost_limit), device=device)
+        limit = check_limit("cost_limit", cost_limit)
+        self.register_coeff_buffer("cost_limit", limit, device=device)
         self.out_keys = ["loss_critic", "loss_cost", "explained_variance", "kl", "cost_estimate"]
         self.out_keys += ["step_fraction", *(f"cpo_{name}" for name in CASES)]
         self.trust, self.cg_steps, self.damping = trust, cg_steps, damping
@@ -177,7 +178,7 @@ class CPOLoss(CostValueMixin, PPOLoss):
 
     @torch.no_grad()
     def cost_of_policy(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """The discounted cost of an episode of the policy that collected a batch, and its decisions.
+        """The cost of an episode of the policy that collected a batch, and its decisions.
 
         Means over the episodes that ended lately (:class:`~saferl.objectives.episodes.EpisodeCost`); before
         the first end, what the running episodes have cost so far and V_c of the rest, as if they went on for ever.
@@ -187,25 +188,24 @@ class CPOLoss(CostValueMixin, PPOLoss):
                 ``InitTracker``) tells where episodes begin.
 
         Returns:
-            Two scalars, J_c in the unit of the cost and a discounted number of decisions.
+            Two scalars, J_c in the unit of the cost and a number of decisions.
         """
         following, keys = tensordict.get("next"), self.tensor_keys
         cost, done = (following.get(key).squeeze(-1) for key in (keys.cost, keys.done))
-        first = tensordict.get(keys.is_init).squeeze(-1)
-        self.episodes.update(cost, first, done, self._cost_value_estimator.gamma)
+        self.episodes.update(cost, tensordict.get(keys.is_init).squeeze(-1), done)
         if self.episodes.count > 0:
-            of_one, weight = self.episodes.mean
-            return of_one.to(cost), weight.to(cost)
+            of_one, decisions = self.episodes.mean
+            return of_one.to(cost), decisions.to(cost)
         with self.cost_critic_params.to_module(self.cost_critic, preserve_module_state=False):
             last = following[..., -1].select(*self.cost_critic.in_keys)
             ahead = self.cost_critic(last).get(keys.state_cost_value).squeeze(-1)
-        so_far, weight, discount, _ = self.episodes.running.unbind(-1)
-        discount = torch.where(done[..., -1], 0.0, discount)
+        so_far, decisions, _ = self.episodes.running.unbind(-1)
         # V_c is of as many decisions as a discount lets count; without one nobody knows how many.
         gamma = float(self._cost_value_estimator.gamma)
-        left = 1 / (1 - gamma) if gamma < 1 else 0.0
-        total, weight = so_far + discount * ahead, weight + discount * left
-        return total.mean().to(cost), weight.mean().to(cost)
+        left = torch.where(done[..., -1], 0.0, 1.0)
+        total = so_far + left * ahead
+        decisions = decisions + (left / (1 - gamma) if gamma < 1 else 0.0)
+        return total.mean().to(cost), decisions.mean().to(cost)
 
     def policy(self, batch: TensorDictBase) -> Distribution:
         """The distribution of actions ``[*B, A]`` in the states of a batch ``[*B]``."""

@@ -7,11 +7,11 @@ from torch import Tensor, nn
 
 
 class EpisodeCost(nn.Module):
-    r"""Means over the episodes that ended lately, followed through as many batches as they take.
+    """Means over the episodes that ended lately, followed through as many batches as they take.
 
-    Of :math:`\sum_{t<L} \gamma^t c_t` (in the unit of the cost) and :math:`\sum_{t<L} \gamma^t` (decisions), L
-    the length of an episode, from its start to its end by termination or truncation. An episode whose start was
-    not seen does not count. The ``state_dict`` holds the episodes that go on, too.
+    Of the cost of an episode (undiscounted, in its unit) and of its decisions, from its start to its end by
+    termination or truncation. An episode whose start was not seen does not count. The ``state_dict`` holds the
+    episodes that go on, too.
 
     Args:
         memory (float, optional): the weight of a batch's episodes against those of the next one in which any
@@ -19,8 +19,8 @@ class EpisodeCost(nn.Module):
 
     Attributes:
         count: how many episodes the means are of, the earlier ones by their weights; a float64 scalar.
-        running: float64 ``[*B, 4]``: of each episode that goes on both sums so far, the next step's discount, and
-            whether its start was seen.
+        running: float64 ``[*B, 3]``: of each episode that goes on its cost and decisions so far, and whether its
+            start was seen.
 
     Raises:
         ValueError: ``memory`` lies outside [0, 1].
@@ -29,9 +29,9 @@ class EpisodeCost(nn.Module):
         >>> episodes = EpisodeCost()
         >>> first = torch.tensor([[True, False, False]])
         >>> done = torch.tensor([[False, False, True]])
-        >>> episodes.update(torch.ones(1, 3), first, done, 0.5)
+        >>> episodes.update(torch.full((1, 3), 0.5), first, done)
         >>> [float(mean) for mean in episodes.mean]
-        [1.75, 1.75]
+        [1.5, 3.0]
     """
 
     ended: Tensor
@@ -43,7 +43,7 @@ class EpisodeCost(nn.Module):
         self.memory = memory
         # Of those that ended: both sums and their number.
         self.register_buffer("ended", torch.zeros(3, dtype=torch.float64))
-        self.running = torch.zeros(0, 4, dtype=torch.float64)
+        self.running = torch.zeros(0, 3, dtype=torch.float64)
 
     def get_extra_state(self) -> dict[str, Tensor]:
         return {"running": self.running}
@@ -57,32 +57,29 @@ class EpisodeCost(nn.Module):
 
     @property
     def mean(self) -> tuple[Tensor, Tensor]:
-        """The discounted cost of an episode and its discounted decisions, scalars; NaN before the first end."""
-        cost, weight = self.ended[:2] / self.ended[2]
-        return cost, weight
+        """The cost of an episode and its decisions, scalars; NaN before the first end."""
+        cost, decisions = self.ended[:2] / self.ended[2]
+        return cost, decisions
 
     @torch.no_grad()
-    def update(self, cost: Tensor, first: Tensor, done: Tensor, gamma: float | Tensor) -> None:
+    def update(self, cost: Tensor, first: Tensor, done: Tensor) -> None:
         """Take a batch, the continuation of the one before where the shapes are equal.
 
         Args:
             cost: ``[*B, T]``, of each transition.
             first, done: bool ``[*B, T]``, whether a transition is an episode's first, and its last.
-            gamma: the discount of a decision.
         """
         running = self.running.to(self.ended.device)
         if running.shape[:-1] != cost.shape[:-1]:
-            running = self.ended.new_tensor([0.0, 0.0, 1.0, 0.0]).expand(*cost.shape[:-1], 4)
-        fresh = running.new_tensor([0.0, 0.0, 1.0, 1.0])
-        gamma = torch.as_tensor(gamma).to(running)
+            running = self.ended.new_zeros(*cost.shape[:-1], 3)
+        fresh = running.new_tensor([0.0, 0.0, 1.0])
         steps = []
         for now, start in zip(cost.unbind(-1), first.unbind(-1), strict=True):
-            total, weight, discount, seen = torch.where(start[..., None], fresh, running).unbind(-1)
-            parts = (total + discount * now, weight + discount, discount * gamma, seen)
-            running = torch.stack(parts, -1)
+            total, decisions, seen = torch.where(start[..., None], fresh, running).unbind(-1)
+            running = torch.stack((total + now, decisions + 1.0, seen), -1)
             steps.append(running)
         self.running = running
         after = torch.stack(steps, -2)
-        ended = after[done & (after[..., 3] > 0)]  # the last column is 1: it counts them
+        ended = after[done & (after[..., 2] > 0)]  # the last column is 1: it counts them
         if len(ended):
-            self.ended.mul_(self.memory).add_(ended[:, [0, 1, 3]].sum(0))
+            self.ended.mul_(self.memory).add_(ended.sum(0))

@@ -52,9 +52,9 @@ class TrustRegionStep:
     - :math:`g` and :math:`b` are the gradients of :meth:`CPOLoss.surrogates <saferl.objectives.CPOLoss.surrogates>`,
       of reward and cost.
     - :math:`H` is the Fisher matrix of the policy, damped.
-    - :math:`c = (J_c - d) / w` is the violation *per decision*, from
+    - :math:`c = (J_c - d) / L` is the violation *per decision*, from the cost of an episode and its decisions,
       :meth:`CPOLoss.cost_of_policy <saferl.objectives.CPOLoss.cost_of_policy>`. g and b are means over decisions, and
-      :math:`J_c(\pi') - J_c(\pi)` is to first order :math:`w` times such a mean.
+      :math:`J_c(\pi') - J_c(\pi)` is to first order :math:`L` times such a mean.
 
     The step is shortened until it keeps three promises: the KL is within :math:`\delta`; the surrogate does not get
     worse, unless the step must first regain feasibility; the cost's surrogate stays below its limit, or does not rise
@@ -104,8 +104,8 @@ class TrustRegionStep:
         Args:
             tensordict: ``[*B, T]`` as the loss's ``begin`` leaves it.
         """
-        cost, weight = self.loss.cost_of_policy(tensordict)
-        violation = float((cost - self.loss.cost_limit) / weight)
+        cost, decisions = self.loss.cost_of_policy(tensordict)
+        violation = float((cost - self.loss.cost_limit) / decisions)
         kl, fraction, case = self.move(tensordict.reshape(-1), violation)
         self.loss.report.copy_(torch.tensor([kl, float(cost), fraction, CASES.index(case)]))
 

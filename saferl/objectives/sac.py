@@ -46,7 +46,7 @@ class SACLagLoss(CostCriticMixin, SACTerms):
         L_\alpha &= E[\alpha (-\log\pi(\tilde a|s) - H_0)]                  & (E14)
 
     - :math:`\tau` is ``terminated``: both targets go on through ``truncated``.
-    - :math:`d` is ``cost_limit``.
+    - :math:`d` is ``risk_limit``.
     - :math:`\rho` is ``lagrange.penalty``: a ReLU for the paper's state-wise constraint, taken for each sample before
       the mean.
     - E12 and E13 share the action :math:`\tilde a'`, which the policy proposes. They use target critics.
@@ -64,7 +64,7 @@ class SACLagLoss(CostCriticMixin, SACTerms):
 
     Keyword Args:
         lagrange (LagrangeMultiplier): the multiplier, saved with the loss.
-        cost_limit (float, optional): d, a bound on the discounted cost value, in the unit of the cost. Defaults to
+        risk_limit (float, optional): d, a bound on the risk in each state, the discounted cost ahead. Defaults to
             ``0.05``.
         cost_target ("max" or "mean", optional): what :math:`Q_c^-` is of the members of the target. Defaults to
             ``"max"`` (paper), whose overestimate feeds itself.
@@ -90,7 +90,7 @@ class SACLagLoss(CostCriticMixin, SACTerms):
         ``"lagrange_multiplier"`` (reward per cost). Into the batch: ``"td_error"`` ``[*B]`` of the reward critics.
 
     Raises:
-        ValueError: ``cost_limit`` is negative or not finite; a number of critics is below one; critics come as a list
+        ValueError: ``risk_limit`` is negative or not finite; a number of critics is below one; critics come as a list
             of one; ``cost_target``, ``cost_backup`` or ``alpha_weight`` is unknown; ``risk`` is no function;
             ``lagrange`` is no multiplier; ``gamma`` lies outside [0, 1]; a batch has multi-step transitions with
             ``cost_backup="reach"``.
@@ -108,7 +108,7 @@ class SACLagLoss(CostCriticMixin, SACTerms):
         ...     tanh_gaussian_actor(MLPPolicyEncoder(rows=3, width=16), width=16),
         ...     value_operator(MLPValue(rows=3, width=16)),
         ...     value_operator(MLPValue(rows=3, width=16), out_key="state_action_cost_value"),
-        ...     cost_limit=0.05,
+        ...     risk_limit=0.05,
         ...     lagrange=DualAscent(init=1.0, lr=1e-4),
         ... )
         >>> loss.make_value_estimator(gamma=0.99)
@@ -151,7 +151,7 @@ class SACLagLoss(CostCriticMixin, SACTerms):
         cost_critic: TensorDictModule | list[TensorDictModule],
         *,
         lagrange: LagrangeMultiplier,
-        cost_limit: float = 0.05,
+        risk_limit: float = 0.05,
         cost_target: CostTarget = "max",
         cost_backup: CostBackup = "sum",
         risk: Callable[[Tensor], Tensor] | None = None,
@@ -196,7 +196,7 @@ class SACLagLoss(CostCriticMixin, SACTerms):
             cost_critic,
             num_cost_critics,
             lagrange=lagrange,
-            cost_limit=cost_limit,
+            risk_limit=risk_limit,
             cost_target=cost_target,
             cost_backup=cost_backup,
             risk=risk,
@@ -248,7 +248,7 @@ class SACLagLoss(CostCriticMixin, SACTerms):
         sample, log_prob = self.sample_action(tensordict)
         action = sample.get(self.tensor_keys.action)
         qvalue = reward.values(action).min(0)[0]
-        penalty = self.lagrange.penalty(cost(action).squeeze(-1) - self.cost_limit)
+        penalty = self.lagrange.penalty(cost(action).squeeze(-1) - self.risk_limit)
         multiplier = self.lagrange.value.detach().to(penalty)
         loss = self.temperature * log_prob - qvalue.squeeze(-1) + multiplier * penalty
         if self.rescale:

@@ -34,6 +34,10 @@ class Budget:
         done = episodes if self.episodes else frames
         return min(1.0, done / self.whole)
 
+    def done(self, progress: Progress) -> int:
+        """How many of the budget's episodes or frames are behind."""
+        return progress.episodes if self.episodes else progress.frames
+
     @property
     def whole(self) -> int:
         """The number of episodes or frames."""
@@ -42,11 +46,16 @@ class Budget:
 
 @dataclass
 class Progress:
-    """Counters of a run; a checkpoint component."""
+    """Counters of a run; a checkpoint component.
+
+    Attributes:
+        last_end: how much of the budget was done when an episode last ended.
+    """
 
     frames: int = 0
     episodes: int = 0
     updates: int = 0
+    last_end: int = 0
     last_record: int = 0
     last_save: int = -1
 

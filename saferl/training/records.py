@@ -73,12 +73,16 @@ class EpisodeWindow:
             for key, value in self.values.items()
         }
 
-    def short(self) -> dict[str, str]:
-        """The summary for a progress bar; empty before the first episode."""
+    def short(self, cost_limit: float | None = None) -> dict[str, str]:
+        """The summary for a progress bar, the cost beside its limit; empty before the first episode."""
         if not any(map(len, self.values.values())):
             return {}
         figures = self.summary()
-        bar = {"return": f"{figures['return']:.1f}", "cost": f"{figures['cost_return']:.3f}"}
+        limit = "" if cost_limit is None else f" of {cost_limit:g}"
+        bar = {
+            "return": f"{figures['return']:.1f}",
+            "cost": f"{figures['cost_return']:.3f}{limit}",
+        }
         rates = {"CR": "collision_rate", "SR": "success_rate"}
         return bar | {name: f"{figures[key]:.0%}" for name, key in rates.items() if key in figures}
 

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+import logging
+import math
+
 from tensordict import TensorDictBase
 
 from saferl.envs.transforms import SafetyProjector
 from saferl.modules import LagrangeMultiplier
+from saferl.training.limit import EARLY
 from saferl.training.trainer import Trainer
+
+log = logging.getLogger(__name__)
 
 
 class CriticSignal:
-    """Dual ascent on Q_c(s, a) - d_thres of each update's batch (E11)."""
+    """Dual ascent on the risk above its limit in the states of each update's batch (E11).
+
+    Args:
+        risk_limit: d_thres, which the loss has, too.
+    """
+
+    def __init__(self, risk_limit: float):
+        self.risk_limit = risk_limit
 
     def register(self, trainer: Trainer) -> None:
         self._lagrange = _multiplier(trainer)
@@ -19,46 +32,50 @@ class CriticSignal:
                 f"lagrange.signal=CriticSignal needs Q_c(s, a), which {type(trainer.learner.loss).__name__} "
                 "has not; use lagrange=episode."
             )
+        limit = float(trainer.learner.loss.risk_limit)  # pyright: ignore[reportArgumentType]
+        if not math.isclose(limit, self.risk_limit, rel_tol=1e-6):
+            raise ValueError(
+                f"loss.risk_limit must be lagrange.signal.risk_limit, got {limit:g} and {self.risk_limit:g}; set risk_limit."
+            )
+        self._begin, self._told = float(self._lagrange.value), False
         trainer.learner.after_update.append(self._update)
+        trainer.after_collect.append(self._watch)
 
     def _update(self, losses: TensorDictBase) -> None:
         self._lagrange.update(losses["constraint_violation"])
 
-
-def episode_budget(cost_limit: float, gamma: float, horizon: float) -> float:
-    """The mean undiscounted cost b of an episode whose discounted form is ``cost_limit`` d.
-
-    Cost spread evenly over T decisions: d = b (1 - gamma^T) / ((1 - gamma) T).
-
-    Args:
-        cost_limit: d_thres.
-        gamma: discount in [0, 1].
-        horizon: T, decisions of an episode.
-
-    >>> round(episode_budget(0.05, gamma=0.99, horizon=125), 4)
-    0.0874
-    """
-    weight = horizon if gamma == 1.0 else (1.0 - gamma**horizon) / (1.0 - gamma)
-    return cost_limit * horizon / weight
+    def _watch(self, finished: TensorDictBase, spent: float) -> None:
+        """Say once that the limit limits nothing."""
+        if spent >= EARLY and not self._told:
+            self._told = True
+            if float(self._lagrange.value) <= self._begin:
+                log.warning(
+                    "risk_limit=%g has limited nothing so far: the multiplier, %.4g, has not risen.",
+                    self.risk_limit,
+                    float(self._lagrange.value),
+                )
 
 
 class EpisodeSignal:
-    """Dual ascent on the mean undiscounted cost of fresh episodes, each used once.
+    """Dual ascent on the mean cost of fresh episodes, each used once.
 
     Args:
-        cost_limit: mean episode cost, undiscounted; see :func:`episode_budget`.
+        cost_limit: mean cost of an episode, undiscounted.
+        relative: whether the violation is a share of the limit (of the mean cost where that is larger) and time a share
+            of the budget, so that one rate serves every task and every budget; else the violation is in the unit of the
+            cost, and every batch in which episodes end is a unit of time.
 
     Raises:
         ValueError: a negative limit.
     """
 
-    def __init__(self, cost_limit: float):
+    def __init__(self, cost_limit: float, relative: bool = True):
         if not cost_limit >= 0:
             raise ValueError(f"cost_limit must be >= 0, got {cost_limit}.")
-        self.cost_limit = cost_limit
+        self.cost_limit, self.relative = cost_limit, relative
 
     def register(self, trainer: Trainer) -> None:
-        self._lagrange = _multiplier(trainer)
+        self._lagrange, self._trainer = _multiplier(trainer), trainer
         if getattr(trainer.learner.loss, "cost_backup", "sum") != "sum":
             raise ValueError(
                 "lagrange.signal=EpisodeSignal limits the summed cost of an episode, which cost_backup=reach does "
@@ -67,9 +84,15 @@ class EpisodeSignal:
         trainer.after_collect.append(self._update)
 
     def _update(self, finished: TensorDictBase, spent: float) -> None:
-        if len(finished):
-            violation = finished["cost_return"] - self.cost_limit
-            self._lagrange.update(self._lagrange.penalty(violation))
+        if not len(finished):
+            return
+        violation, elapsed = finished["cost_return"] - self.cost_limit, 1.0
+        if self.relative:
+            mean = float(self._trainer.window.values["cost_return"].mean())
+            violation = violation / (max(self.cost_limit, abs(mean)) or 1.0)
+            progress, budget = self._trainer.progress, self._trainer.budget
+            elapsed = (budget.done(progress) - progress.last_end) / budget.whole
+        self._lagrange.update(self._lagrange.penalty(violation), elapsed)
 
 
 class ProjectorProgress:

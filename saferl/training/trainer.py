@@ -23,6 +23,7 @@ from saferl.checkpoint.run import RunCheckpoint
 from saferl.checkpoint.state import CollectorState, Fitting, GrowingFiles
 from saferl.evaluation.progress import bar
 from saferl.training.learner import Learner
+from saferl.training.limit import CostWatch
 from saferl.training.progress import Budget, Clock, Progress
 from saferl.training.records import CsvLog, EpisodeWindow
 
@@ -93,6 +94,7 @@ class Trainer:
         open_loggers: makes the TorchRL loggers that receive the scalars of each row; called when
             training starts.
         window: means over the last episodes.
+        watch: of the limit on the mean cost of an episode.
     """
 
     run: Path
@@ -104,6 +106,7 @@ class Trainer:
     save_every: int = 50_000
     save_minutes: float | None = 5.0
     window: EpisodeWindow = field(default_factory=EpisodeWindow)
+    watch: CostWatch = field(default_factory=CostWatch)
     after_collect: list[Callable[[TensorDictBase, float], None]] = field(default_factory=list)
     open_loggers: Callable[[], Sequence[Logger]] = list
 
@@ -131,6 +134,7 @@ class Trainer:
             progress=self.progress,
             clock=self.clock,
             window=self.window,
+            watch=self.watch,
             record=self,
             files=GrowingFiles(self.metrics.path, self.timing.path),
         )
@@ -157,6 +161,11 @@ class Trainer:
         self.collector.shutdown()
 
     @property
+    def _costs(self) -> Tensor | None:
+        """Of the last episodes [n]."""
+        return self.window.values.get("cost_return")
+
+    @property
     def spent(self) -> float:
         """Fraction of the budget that is spent, in [0, 1]."""
         return self.budget.spent(self.progress.frames, self.progress.episodes)
@@ -169,13 +178,12 @@ class Trainer:
             ValueError: an action, a loss term or a parameter is not finite; names it and the frame.
         """
         progress = self.progress
-        by_episode = self.budget.episodes is not None
         shown = bar(
             total=self.budget.whole,
-            initial=progress.episodes if by_episode else progress.frames,
-            unit="episode" if by_episode else "frame",
+            initial=self.budget.done(progress),
+            unit="episode" if self.budget.episodes else "frame",
             desc="train",
-            postfix=self.window.short(),
+            postfix=self.window.short(self.watch.limit),
         )
         batches = iter(self.collector)
         with self._logging(), _interrupts() as interrupted, shown:
@@ -186,8 +194,8 @@ class Trainer:
                 with self.clock.phase("collect"):
                     data = next(batches)
                 if len(self._take(data)):
-                    shown.set_postfix(self.window.short(), refresh=False)
-                shown.update((progress.episodes if by_episode else progress.frames) - shown.n)
+                    shown.set_postfix(self.window.short(self.watch.limit), refresh=False)
+                shown.update(self.budget.done(progress) - shown.n)
                 if progress.frames - progress.last_record >= self.record_every:
                     self._record()
                 if self._save_is_due() and self.spent < 1.0:
@@ -200,6 +208,7 @@ class Trainer:
             if progress.frames > progress.last_record:
                 self._record()
         self.save()
+        self.watch.judge(self._costs)
 
     @contextmanager
     def _logging(self) -> Iterator[None]:
@@ -278,6 +287,8 @@ class Trainer:
         progress.episodes += finished.shape[0]
         for hook in self.after_collect:
             hook(finished, self.spent)
+        if len(finished):
+            progress.last_end = self.budget.done(progress)
         with self.clock.phase("learn"):
             for batch in self.experience.batches(data, progress.frames):
                 progress.updates += 1
@@ -294,6 +305,7 @@ class Trainer:
         """One row of ``metrics.csv`` (no wall-clock) and one of ``timing.csv``."""
         progress = self.progress
         progress.last_record = progress.frames
+        self.watch.look(self._costs, progress.frames, self.spent)
         row = {
             "frames": progress.frames,
             "episodes": progress.episodes,

@@ -83,7 +83,7 @@ def test_init_begins_from_the_networks_alone(algo: str, run: Path, tmp_path: Pat
     """Of a run without cost critics too; the settings are those of the new configuration."""
     options = (
         "gamma=0.5",
-        "cost_limit=0.3",
+        "risk_limit=0.3",
         "learning.alpha_init=0.7",
         "learning.target_entropy=-1",
     )
@@ -99,18 +99,20 @@ def test_init_begins_from_the_networks_alone(algo: str, run: Path, tmp_path: Pat
             assert (ours[name] == fresh[name]).all(), name
     assert float(ours["log_alpha"].exp()) == pytest.approx(0.7)
     assert ours["_value_estimator.gamma"] == 0.5
-    assert algo == "sac" or ours["cost_limit"] == pytest.approx(0.3)
+    assert algo == "sac" or ours["risk_limit"] == pytest.approx(0.3)
     assert trainer.progress.frames == 0 and trainer.collector.init_random_frames == 0
 
 
 def test_init_among_on_policy_algorithms(tmp_path: Path, refusal):
     """Both values are taken over; weights that were trained with another activation are not."""
     first = tmp_path / "first"
-    cfg = compose(*SMALL, "algo=ppo_lag", "task=cart")
+    tanh, limits = "encoder.activation.path=torch.nn.Tanh", ("cost_limit=1", "risk_limit=1")
+    cfg = compose(*SMALL, "algo=ppo_lag", tanh, "task=cart", *limits)
     build_trainer(cfg, first).train()
     OmegaConf.save(cfg, first / CONFIG, resolve=True)
     theirs = load_agent(run_config(first), first, "x").loss.state_dict()
-    options = ("algo=cpo", "encoder=mlp_tanh", "task=cart", "seed=9", f"init={first}")
+
+    options = ("algo=cpo", tanh, "task=cart", *limits, "seed=9", f"init={first}")
     ours = build_trainer(compose(*SMALL, *options), tmp_path / "x").learner.loss.state_dict()
     networks = [key for key in ours if "_params." in key and "target_" not in key]
     assert {key.split(".")[0] for key in networks} == {
@@ -119,7 +121,7 @@ def test_init_among_on_policy_algorithms(tmp_path: Path, refusal):
     for key in networks:
         assert not isinstance(ours[key], torch.Tensor) or torch.equal(ours[key], theirs[key]), key
     for algo in ("cpo", "sac"):
-        line = refusal(*TRAIN, *SMALL, f"algo={algo}", "task=cart", f"init={first}")
+        line = refusal(*TRAIN, *SMALL, f"algo={algo}", "task=cart", "cost_limit=1", f"init={first}")
         assert "do not fit: encoder." in line and "torch.nn.Tanh" in line
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import hydra
 import pytest
 import torch
 from omegaconf import OmegaConf
@@ -13,6 +12,7 @@ from small import EMPTY, SMALL, compose
 from saferl.algorithms.assemble import build_agent, build_trainer
 from saferl.cli.evaluate import on_its_own_task
 from saferl.config.check import arguments, check, fits
+from saferl.config.limits import check_limits, readers
 from saferl.config.locate import config_dir
 from saferl.modules import MeanStd, MLPPolicyEncoder, MMAMPolicyEncoder
 
@@ -24,7 +24,11 @@ OPTIONS = sorted(
 )
 ALGOS = sorted(path.stem for path in (ROOT / "algo").glob("*.yaml"))
 #: What an option needs beside it.
-BESIDE = {"task=gym": ("task.id=Pendulum-v1", "task.cost_key=null")}
+LIMITS = ("cost_limit=1", "risk_limit=1")
+BESIDE = {
+    "task=gym": ("task.id=Pendulum-v1", "task.cost_key=null", *LIMITS),
+    "task=cart": LIMITS,
+}
 #: Encoder, cost critics, multiplier's signal, projector, r_safe: the table of the paper.
 PARTS = {
     "arsac": (MMAMPolicyEncoder, 2, "CriticSignal", True, False),
@@ -141,12 +145,12 @@ def test_critics_are_built_as_their_options_say(encoder: str):
     for option in ("critic.layer_norm=true", "cost_critic.layer_norm=true"):
         assert sum(critic.layer_norm for critic in critics(option)) == 1
     plain, quantiles = critics("cost_critic=quantile")
-    scene = torch.zeros(3, 17), torch.zeros(3, 11, 14), torch.zeros(3, 2)
+    scene = torch.zeros(3, 12), torch.zeros(3, 11, 12), torch.zeros(3, 2)
     assert plain(*scene).shape == (3, 1) and quantiles(*scene).shape == (3, 16)
 
 
 @pytest.mark.parametrize("algo", ["sac_lag", "ppo_lag"])
-@pytest.mark.parametrize("lagrange", ["episode", "pid_episode"])
+@pytest.mark.parametrize("lagrange", ["episode", "pid"])
 def test_every_multiplier_of_episodes_goes_with_every_loss(algo, lagrange, tmp_path: Path):
     cfg = compose(*SMALL, *EMPTY, f"algo={algo}", f"lagrange={lagrange}")
     build_trainer(cfg, tmp_path).train()
@@ -155,7 +159,7 @@ def test_every_multiplier_of_episodes_goes_with_every_loss(algo, lagrange, tmp_p
 @pytest.mark.parametrize("algo", ALGOS)
 def test_what_a_task_has_not_is_refused(algo: str, tmp_path: Path):
     """A shaped reward and a scene belong to the road; all else goes with a cart, too."""
-    cfg = compose(*SMALL, f"algo={algo}", "task=cart")
+    cfg = compose(*SMALL, f"algo={algo}", "task=cart", *LIMITS)
     shaped, scene = cfg.task.get("reward"), cfg.encoder._target_.endswith((".MMAM", ".MaxPool"))
     if not shaped and not scene:
         build_trainer(cfg, tmp_path)
@@ -187,22 +191,32 @@ def test_arsac_plus_is_arsac_with_another_risk():
 
 
 @pytest.mark.parametrize(
-    ("options", "limit"),
+    ("algo", "read"),
     [
-        ((), 0.0874),
-        (("cost_limit=0.5",), 0.874),
-        (("gamma=1",), 0.05),
-        (("gamma=0",), 0.05 * 125),
-        (("task.duration=50", "task.policy_frequency=10"), 0.05 * 5 / (1 - 0.99**500)),
-        (("cost_limit=0.5", "lagrange.signal.cost_limit=0.2"), 0.2),
+        *((algo, {"risk_limit"}) for algo in ("arsac", "arsac_plus", "arsac_signed", "rsac")),
+        *((algo, {"cost_limit"}) for algo in ("sac_lag", "sac_pid", "ppo_lag", "cpo")),
+        ("arppo", {"cost_limit", "risk_limit"}),
+        *((algo, set()) for algo in ("sac", "sac_rs", "asac", "ppo", "ppo_rs")),
     ],
 )
-def test_cost_limit_sets_the_episode_budget_of_sac_lag(options, limit: float):
-    """d = b (1 - g^T) / ((1 - g) T), unless the budget b itself is given."""
-    cfg = compose("algo=sac_lag", *options)
-    check(cfg)
-    signal = hydra.utils.instantiate(cfg.lagrange.signal)
-    assert signal.cost_limit == pytest.approx(limit, rel=1e-3)
+def test_limits_mean_one_thing(algo: str, read: set[str]):
+    """On an episode, or on the risk in each state (docs/pitfalls.md, 6); each is asked for where it is read."""
+    cfg = compose(f"algo={algo}", "task=cart", "cost_limit=3", "risk_limit=2")
+    assert {name for name, keys in readers(cfg).items() if keys} == read
+    check_limits(cfg, [])
+    for name in read:
+        where = OmegaConf.to_container(cfg, resolve=True)
+        for key in readers(cfg)[name]:
+            assert OmegaConf.select(cfg, key) == {"cost_limit": 3, "risk_limit": 2}[name]
+        cfg[name] = None
+        with pytest.raises(ValueError, match=f"{name} must be given: it bounds the "):
+            check_limits(cfg, [])
+        cfg[name] = where[name]
+    alone = {"cost_limit", "risk_limit"} - read
+    for name in alone if len(alone) == 1 else {"risk_limit"} - read:
+        with pytest.raises(ValueError, match=f"{name} is on the .* algo={algo} does not bound"):
+            check_limits(cfg, [f"{name}=1"])
+    check_limits(cfg, ["cost_limit=1", *(f"{name}=1" for name in read)])
 
 
 @pytest.mark.parametrize("option", [o for o in OPTIONS if o.startswith("experiment=")])
@@ -247,7 +261,7 @@ UNREAD = {
     "sac": ("learning.gae_lambda=0.1", "learning.rollout_frames=77", "learning.epochs=3",
             "loss.cost_target=max", "lagrange.multiplier.lr=1", "projector.steps=3", "cost_critic.size=3"),
     "ppo": ("learning.tau=0.5", "learning.updates_per_frame=3", "learning.alpha_init=9",
-            "learning.buffer_size=5000", "learning.lr.alpha=[1,1]", "loss.cost_limit=1", "tau=0.5"),
+            "learning.buffer_size=5000", "learning.lr.alpha=[1,1]", "loss.risk_limit=1", "tau=0.5"),
 }  # fmt: skip
 
 
@@ -263,7 +277,7 @@ def test_a_typo_in_a_preset_is_refused():
     for key, value, message in (
         ("encoder.depht", 3, r"unknown key encoder.depht: .* takes .*width"),
         ("task.vehicels", 3, "unknown key task.vehicels: .*Scenario takes task, vehicles"),
-        ("loss.cost_limits", 3, "unknown key loss.cost_limits"),
+        ("loss.risk_limits", 3, "unknown key loss.risk_limits"),
         ("projector.step_size", "0.02 rad", "projector.step_size must be a number, got '0.02 rad'"),
         ("task.reward.weights", [1, "x"], "task.reward.weights must be a list, each a number"),
         ("task.standstill", "never", "task.standstill must be a number or null, got 'never'"),

@@ -13,15 +13,17 @@ from small import EMPTY, SMALL, compose
 from saferl.algorithms import assemble
 from saferl.cli.train import closing_test
 from saferl.config.check import check
+from saferl.config.limits import readers
 from saferl.config.locate import config_dir
 
 ALGOS = sorted(path.stem for path in (Path(config_dir()) / "algo").glob("*.yaml"))
+LIMITS = ("cost_limit=1", "risk_limit=1")
 #: A road's own encoder reads no plain observation.
 TASKS = {
     "batched": ("task=mixed", *EMPTY, "evaluation.drivers=[blind]"),
     "highway": ("task=gs", "env=highway", "task.vehicles=0"),
-    "cart": ("task=cart", "encoder=mlp"),
-    "gym": ("task=gym", "task.id=Pendulum-v1", "task.cost_key=null", "encoder=mlp"),
+    "cart": ("task=cart", "encoder=mlp", *LIMITS),
+    "gym": ("task=gym", "task.id=Pendulum-v1", "task.cost_key=null", "encoder=mlp", *LIMITS),
 }
 #: Read before a run is built: by Hydra, for its folder, and by the command.
 EARLIER = {"out", "resume"}
@@ -72,6 +74,7 @@ def test_every_leaf_is_read_by_a_training(
     cfg = compose(*SMALL, f"algo={algo}", *TASKS[task])
     if task in ("cart", "gym") and cfg.task.get("reward"):
         pytest.skip("refused: a shaped reward is the road's")
+    unread = {name for name, keys in readers(cfg).items() if not keys} - {"cost_limit"}
     assemble.complete(cfg.task)
     check(cfg)
     names, seen = watched(cfg)
@@ -82,6 +85,6 @@ def test_every_leaf_is_read_by_a_training(
     trainer = assemble.build_trainer(cfg, tmp_path)
     trainer.train()
     closing_test(cfg, tmp_path)
-    assert names - seen == EARLIER
+    assert names - seen == EARLIER | unread
     assert trainer.progress.frames >= 12 and trainer.progress.updates >= 3
     assert (tmp_path / "metrics.csv").read_text().count("\n") >= 2

@@ -19,7 +19,6 @@ from saferl.envs.intersection.observation import (
     FORMS,
     HORIZON,
     PATIENCE,
-    PREVIEW,
     REACH,
     as_world,
     observe,
@@ -62,21 +61,14 @@ def turned_path(x, y, heading, pace, omega, times):
 def looped_route(ego, vehicles, present, route, rows):
     """The route's form by plain loops, from the world's and a search along the lines."""
     own, world, nearest = looped(ego, vehicles, present, route, rows)
-    lines = reference_lines(torch.tensor(int(route)), torch.zeros(1, dtype=torch.float64))
-    offsets, headings = [], []
-    start = nearest_on(lines[0], ego[0], ego[1])[1]
-    for line in lines:
-        (x, y, heading), _ = nearest_on(line, ego[0], ego[1])
-        offsets.append((ego[1] - y) * math.cos(heading) - (ego[0] - x) * math.sin(heading))
-        headings.append(folded(ego[4] - heading))
-    ahead = [
-        folded(float(line_pose(lines[0], torch.tensor(start + d).double())[2]) - ego[4])
-        for d in PREVIEW
-    ]
+    line = reference_lines(torch.tensor(int(route)), torch.zeros(1, dtype=torch.float64))[0]
+    (x, y, heading), start = nearest_on(line, ego[0], ego[1])
+    offset = (ego[1] - y) * math.cos(heading) - (ego[0] - x) * math.sin(heading)
     one_hot = [float(route == k) for k in range(4)]
-    features = [*ego[2:4], ego[5], *offsets, *headings, *ahead, start - 100.0, *one_hot, *own[-2:]]
+    error = folded(ego[4] - heading)
+    features = [*ego[2:4], ego[5], offset, error, start - 100.0, *one_hot, *own[-2:]]
 
-    table = np.zeros((rows, 14))
+    table = np.zeros((rows, 12))
     turn = complex(math.cos(ego[4]), -math.sin(ego[4]))
     for row, index in enumerate(nearest):
         place = complex(*world[row, 1:3]) * turn
@@ -85,7 +77,7 @@ def looped_route(ego, vehicles, present, route, rows):
         where, when = REACH, PATIENCE
         x, y, pace, _, heading, omega = vehicles[index]
         for step in np.arange(0.0, REACH, 2.5):
-            point = line_pose(lines[0], torch.tensor(start + step).double())
+            point = line_pose(line, torch.tensor(start + step).double())
             way = complex(float(point[0]) - x, float(point[1]) - y)
             way *= complex(math.cos(heading), -math.sin(heading))
             if abs(way.imag) < 2.5 and way.real > -2.5:
@@ -94,11 +86,10 @@ def looped_route(ego, vehicles, present, route, rows):
         lead = min(max(where / max(ego[2], 1.0) - when, -PATIENCE), PATIENCE)
         gaps, times = [], np.arange(0.0, HORIZON + 0.1, 0.25)
         for time, at in zip(times, turned_path(x, y, heading, pace, omega, times), strict=True):
-            point = line_pose(lines[0], torch.tensor(start + ego[2] * time).double())
+            point = line_pose(line, torch.tensor(start + ego[2] * time).double())
             gaps.append(math.dist(point[:2].tolist(), at))
         table[row] = [1, place.real, place.imag, speed.real, speed.imag, math.sin(angle),
-                      math.cos(angle), omega, 10 / (5 + abs(place)), where, when, lead, min(gaps),
-                      0.25 * int(np.argmin(gaps))]  # fmt: skip
+                      math.cos(angle), where, when, lead, min(gaps), 0.25 * int(np.argmin(gaps))]  # fmt: skip
     return np.array(features), table, nearest
 
 
@@ -131,7 +122,7 @@ def test_the_route_form_equals_a_loop(rows):
         np.testing.assert_allclose(ours[0].numpy(), own, atol=0.012)  # the search's centimetre
         # A corridor's edge may lie within that centimetre: there the first meeting is another one.
         same = np.isclose(ours[1].numpy(), table, atol=0.015)
-        assert same[:, :9].all() and same[:, 12].all() and same[:, 9:].mean() > 0.98
+        assert same[:, :7].all() and same[:, 10].all() and same[:, 7:].mean() > 0.98
         assert ours[2].nonzero().flatten().tolist() == sorted(nearest)
 
 

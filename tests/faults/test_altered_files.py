@@ -32,7 +32,7 @@ MUTATIONS = (
 @pytest.fixture(scope="module")
 def trainer(tmp_path_factory: pytest.TempPathFactory) -> Trainer:
     trainer = build_trainer(
-        compose(*SMALL, "algo=sac_lag", "task=cart"), tmp_path_factory.mktemp("run")
+        compose(*SMALL, "algo=sac_lag", "task=cart", "cost_limit=1"), tmp_path_factory.mktemp("run")
     )
     trainer.train()
     return trainer

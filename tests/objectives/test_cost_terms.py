@@ -158,7 +158,7 @@ def test_reachability_is_the_largest_cost_ahead():
 
 @pytest.mark.parametrize(("outputs", "members", "risk"), [(1, 4, MeanStd(2.0)), (5, 2, CVaR(0.5))])
 def test_one_risk_for_loss_and_projector(outputs: int, members: int, risk):
-    loss, data = build(outputs, members, risk=risk, cost_limit=0.1), batch_of()
+    loss, data = build(outputs, members, risk=risk, risk_limit=0.1), batch_of()
     torch.manual_seed(5)
     _, metadata = loss.actor_loss(data)
     torch.manual_seed(5)

@@ -73,7 +73,7 @@ def sac() -> tuple[SACLagLoss, TensorDict]:
         target_entropy=settings["target_entropy"],
         # OmniSafe penalises the cost itself and divides the loss by 1 + lambda.
         lagrange=DualAscent(init=settings["lagrangian_multiplier"], signed=True),
-        cost_limit=0.0,
+        risk_limit=0.0,
         rescale=True,
     )
     loss.make_value_estimator(gamma=settings["gamma"])

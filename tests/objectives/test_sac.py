@@ -27,7 +27,7 @@ from saferl.objectives import SACLagLoss
     ],
 )
 def test_each_loss_trains_its_own_parameters_only(make_loss, make_batch, term, owner):
-    loss = make_loss(cost_limit=0.0)
+    loss = make_loss(risk_limit=0.0)
     output = run(loss, make_batch())
     assert output["constraint_violation"] > 0
     before = {name: value.clone() for name, value in loss.state_dict().items()}
@@ -59,7 +59,7 @@ def test_state_dict_fills_a_fresh_loss(make_loss, make_batch):
     state = deepcopy(loss.state_dict())
     for part in ("target_qvalue_network_params", "target_cost_critic_params", "lagrange.value"):
         assert any(name.startswith(part) for name in state)
-    fresh = make_loss(seed=7, gamma=0.5, cost_limit=0.9, lagrange=DualAscent(init=0.1))
+    fresh = make_loss(seed=7, gamma=0.5, risk_limit=0.9, lagrange=DualAscent(init=0.1))
     view = fresh.cost_value
     fresh.load_state_dict(state, strict=True)
     assert_same(run(loss, batch), run(fresh, batch))

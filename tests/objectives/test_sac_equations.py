@@ -102,7 +102,7 @@ def draws(monkeypatch, float64):
 
 def test_every_term_and_its_gradient_match_the_reference(make_loss, make_batch, draws):
     multiplier = DualAscent(init=LAMBDA)
-    loss = make_loss(cost_limit=LIMIT, alpha_init=ALPHA, gamma=GAMMA, lagrange=multiplier)
+    loss = make_loss(risk_limit=LIMIT, alpha_init=ALPHA, gamma=GAMMA, lagrange=multiplier)
     batch, reference = make_batch(), Reference(loss)
     assert batch["observation"].dtype == torch.float64
     expected = reference(batch, *draws)
@@ -144,7 +144,7 @@ def constant_loss(make_loss):
         qvalue_network=constants("state_action_value", 1.0, 2.0),
         cost_critic=constants("state_action_cost_value", 0.1, 0.4),
         alpha_init=0.5,
-        cost_limit=0.3,
+        risk_limit=0.3,
         gamma=0.8,
         lagrange=DualAscent(init=2.0),
     )
@@ -258,7 +258,7 @@ def test_relu_is_taken_for_each_sample_before_the_mean(make_loss, reduction):
         for _ in range(2)
     ]
     multiplier = DualAscent(init=1.0, lr=0.1)
-    loss = make_loss(cost_critic=members, cost_limit=0.5, lagrange=multiplier, reduction=reduction)
+    loss = make_loss(cost_critic=members, risk_limit=0.5, lagrange=multiplier, reduction=reduction)
     batch = torch.cat([transition(), transition()])
     batch["observation"][:, 0] = torch.tensor([0.9, 0.1])
     output = loss(batch)
@@ -270,7 +270,7 @@ def test_relu_is_taken_for_each_sample_before_the_mean(make_loss, reduction):
 
 
 def test_violation_is_the_derivative_of_the_actor_term(make_loss, make_batch):
-    loss, outputs = make_loss(cost_limit=0.0), []
+    loss, outputs = make_loss(risk_limit=0.0), []
     for multiplier in (0.0, 1.0):
         loss.lagrange.value.fill_(multiplier)
         torch.manual_seed(3)

@@ -14,9 +14,9 @@ def test_a_bad_cost_target_is_named(make_loss):
 
 
 @pytest.mark.parametrize("limit", [-1.0, float("nan"), float("inf")])
-def test_a_bad_cost_limit_is_named(make_loss, limit):
-    with pytest.raises(ValueError, match=rf"cost_limit must be >= 0, got {limit}\."):
-        make_loss(cost_limit=limit)
+def test_a_bad_risk_limit_is_named(make_loss, limit):
+    with pytest.raises(ValueError, match=rf"risk_limit must be >= 0, got {limit}\."):
+        make_loss(risk_limit=limit)
 
 
 @pytest.mark.parametrize("gamma", [1.2, -0.1, float("nan")])

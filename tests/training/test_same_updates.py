@@ -45,10 +45,10 @@ def batch(seed: int) -> TensorDict:
     generator = torch.Generator().manual_seed(seed)
 
     def scene():
-        vehicles = torch.randn(32, 11, 14, generator=generator) * 10
+        vehicles = torch.randn(32, 11, 12, generator=generator) * 10
         count = torch.randint(0, 11, (32, 1), generator=generator)
         vehicles[..., 0] = (torch.arange(11) < count).to(vehicles)
-        return {"ego": torch.randn(32, 17, generator=generator) * 5, "vehicles": vehicles}
+        return {"ego": torch.randn(32, 12, generator=generator) * 5, "vehicles": vehicles}
 
     ended = torch.rand(32, 1, generator=generator) < 0.1
     following = {

@@ -205,7 +205,7 @@ def test_projector_starts_when_it_is_told(tmp_path: Path):
 
 
 def test_buffer_keeps_the_executed_action_and_unscaled_reward(tmp_path: Path):
-    options = ("algo=rsac", "cost_limit=0", "learning.reward_scale=0.1", "projector.start=0")
+    options = ("algo=rsac", "risk_limit=0", "learning.reward_scale=0.1", "projector.start=0")
     trainer = trainer_of(tmp_path, *options)
     always_risky(trainer)
     data = torch.cat([each.reshape(-1) for each in collect(trainer, 3)])

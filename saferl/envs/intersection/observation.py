@@ -28,8 +28,6 @@ from saferl.envs.intersection.geometry import (
 AHEAD = 70.0  # m along the ego's heading
 BEHIND = 30.0
 ROWS = 11
-#: Where the heading of the line is told, m ahead of the ego.
-PREVIEW = (4.0, 8.0, 16.0)
 #: How far ahead along the line, and for how long, a vehicle's way is followed: m, s.
 REACH, PATIENCE = 40.0, 8.0
 _SPACING = 2.5  # m between the points of the line that it may cross
@@ -67,10 +65,9 @@ FORMS = {
     "route": Form(
         ego={
             "v_x": 10.0, "v_y": 2.0, "omega": 1.0,  # m/s, m/s, rad/s
-            "offset": 2.0, "offset_other": 2.0,  # m, to the right of each reference line
-            "heading": 0.5, "heading_other": 0.5,  # rad, against the lines' own
-            **{f"ahead_{distance:g}": 0.5 for distance in PREVIEW},  # rad, the line's there against the ego's
-            "s": 20.0,  # m along the own line, 0 at the box
+            "offset": 2.0,  # m, to the right of its line
+            "heading": 0.5,  # rad, against the line's
+            "s": 20.0,  # m along the line, 0 at the box
             **dict.fromkeys(ROUTES, 1.0),
             "d_veh": 20.0, "d_des": 50.0,  # m
         },
@@ -79,9 +76,7 @@ FORMS = {
             "x": 20.0, "y": 20.0,  # m ahead of the ego and to its right
             "v_x": 10.0, "v_y": 10.0,  # m/s likewise, relative to the ego's
             "sin": 1.0, "cos": 1.0,  # of its heading against the ego's
-            "omega": 1.0,  # rad/s, its yaw rate
-            "near": 1.0,  # 10 m / (5 m + distance)
-            "conflict_s": 20.0,  # m along the own line to where its way first meets it
+            "conflict_s": 20.0,  # m along the ego's line to where its way first meets it
             "conflict_t": 4.0,  # s until it is there
             "lead": 4.0,  # s that the ego is there later
             "closest": 10.0,  # m between both centres when they are closest, at their speeds and turns of now
@@ -234,8 +229,7 @@ def observe(
     seen = present.movedim(-1, 0) & (ahead <= AHEAD) & (ahead >= -BEHIND)
 
     # The row of each vehicle: how many are nearer.
-    gap = torch.hypot(dx, dy)
-    distance = torch.where(seen, gap, torch.inf)
+    distance = torch.where(seen, torch.hypot(dx, dy), torch.inf)
     number = torch.arange(len(x), device=x.device).reshape(-1, *[1] * (x.ndim - 1))
     tie = (distance[None] == distance[:, None]) & (number[None] < number[:, None])
     row = ((distance[None] < distance[:, None]) | tie).sum(1)
@@ -256,18 +250,13 @@ def observe(
             torch.remainder(heading + _SEAM, 2 * math.pi) - _SEAM,
         ]
     else:
-        lines = reference_lines(route, ego).movedim(-3, 0)  # the two lines first
-        pose, s, _ = project(ego[..., :2], lines)
+        line = reference_lines(route, ego)[..., 0, :, :]
+        pose, s, _ = project(ego[..., :2], line)
         line_cos, line_sin = torch.cos(pose[..., 2]), torch.sin(pose[..., 2])
         offset = (own_y - pose[..., 1]) * line_cos - (own_x - pose[..., 0]) * line_sin
         error = wrap(phi - pose[..., 2])
-        preview = s.new_tensor(PREVIEW).reshape(-1, *[1] * phi.ndim)
-        bend = line_pose(lines[0].expand(len(preview), *lines.shape[1:]), s[0] + preview)[..., 2]
         routes = torch.arange(len(ROUTES), device=route.device).reshape(-1, *[1] * route.ndim)
-        own = [
-            own_v_x, own_v_y, omega, *offset, *error, *wrap(bend - phi), s[0] - ARM,
-            *(route == routes).to(phi),
-        ]  # fmt: skip
+        own = [own_v_x, own_v_y, omega, offset, error, s - ARM, *(route == routes).to(phi)]
         turn_cos, turn_sin = v_cos * cos + v_sin * sin, v_sin * cos - v_cos * sin
         features = [
             ahead,
@@ -276,12 +265,10 @@ def observe(
             (v_x * turn_sin + v_y * turn_cos) - own_v_y,
             turn_sin,
             turn_cos,
-            yaw_rate,
-            10.0 / (5.0 + gap),
         ]
-        where, when = _conflict(x, y, v_cos, v_sin, v_x, lines[0], s[0])
+        where, when = _conflict(x, y, v_cos, v_sin, v_x, line, s)
         lead = (where / own_v_x.clamp_min(1.0) - when).clamp(-PATIENCE, PATIENCE)
-        close = _closest(x, y, heading, v_x, yaw_rate, lines[0], s[0], own_v_x)
+        close = _closest(x, y, heading, v_x, yaw_rate, line, s, own_v_x)
         features += [where, when, lead, *close]
     places = torch.arange(rows, device=x.device).reshape(-1, *[1] * x.ndim)
     here = (places == row) & seen  # [M, N, ...]
@@ -291,7 +278,7 @@ def observe(
 
 
 def as_world(ego: Tensor, vehicles: Tensor) -> tuple[Tensor, Tensor]:
-    """An observation of either form as one of ``world``, which knows no yaw rate but the ego's.
+    """An observation of either form as one of ``world``.
 
     Args:
         ego: [..., F].
