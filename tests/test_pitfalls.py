@@ -35,7 +35,14 @@ def test_named_test_exists(file: str, name: str):
 @pytest.mark.parametrize("algo", ["sac_lag", "ppo_lag", "cpo"])
 def test_costs_are_stored_as_they_are(algo: str, tmp_path: Path):
     """Where there is none, the critics learn from 0; the reward alone is scaled."""
-    options = (*SMALL, f"algo={algo}", "task=cart", "cost_limit=1", "learning.reward_scale=0.5", "frames=16")
+    options = (
+        *SMALL,
+        f"algo={algo}",
+        "task=cart",
+        "cost_limit=1",
+        "learning.reward_scale=0.5",
+        "frames=16",
+    )
     trainer = build_trainer(compose(*options), tmp_path)
     data = next(iter(trainer.collector))
     batches = list(trainer.experience.batches(data, frames=8))
@@ -52,7 +59,14 @@ def test_costs_are_stored_as_they_are(algo: str, tmp_path: Path):
 
 @pytest.mark.parametrize("algo", ["ppo", "ppo_lag", "cpo"])
 def test_on_policy_batches_without_an_end(algo: str, tmp_path: Path):
-    options = (*SMALL, f"algo={algo}", "task=cart", "cost_limit=1", "task.horizon=1000", "frames=32")
+    options = (
+        *SMALL,
+        f"algo={algo}",
+        "task=cart",
+        "cost_limit=1",
+        "task.horizon=1000",
+        "frames=32",
+    )
     trainer = build_trainer(compose(*options), tmp_path)
     trainer.train()
     assert trainer.progress.episodes == 0 and trainer.progress.updates > 0

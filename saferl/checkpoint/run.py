@@ -17,6 +17,7 @@ from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation, 
 
 from saferl.checkpoint.sealed import Damaged, sealed
 from saferl.checkpoint.state import Fitting
+from saferl.config.foreign import check_origin
 
 CONFIG = "config.yaml"
 FOLDER = "checkpoints"
@@ -118,9 +119,13 @@ def run_config(path: Path, option: str = "checkpoint") -> DictConfig:
 
     Raises:
         FileNotFoundError: it is not there.
+        ValueError: it names what a file may not call (:func:`saferl.config.foreign.check_origin`).
     """
-    cfg = OmegaConf.load(run_folder(path, option) / CONFIG)
-    assert isinstance(cfg, DictConfig)
+    file = run_folder(path, option) / CONFIG
+    cfg = OmegaConf.load(file)
+    if not isinstance(cfg, DictConfig):
+        raise ValueError(f"{option}: {file} holds no settings.")
+    check_origin(OmegaConf.to_container(cfg, resolve=False), file)
     return cfg
 
 

@@ -19,6 +19,7 @@ from saferl.cli.arguments import PATHS, readable
 from saferl.cli.errors import MISTAKES, explain
 from saferl.config import schema
 from saferl.config.locate import config_dir
+from saferl.config.machine import check_machine
 
 INTERRUPTED = 130
 #: What a job of a sweep leaves in its folder where it could not run to its end.
@@ -59,6 +60,7 @@ def launch(command: str, config: str) -> None:
                     raise ValueError(f"{key} must be a path, got ''.")
             if cfg.get("resume") is None:  # else the run's own is checked
                 schema.check(cfg)
+                check_machine(cfg)
             # Late: help and most mistakes need no torch.
             getattr(importlib.import_module(f"saferl.cli.{command}"), command)(cfg)
         except BaseException as error:

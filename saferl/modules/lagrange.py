@@ -133,7 +133,7 @@ class PIDMultiplier(LagrangeMultiplier):
 
     If ``exponential`` (ours), what is controlled is log(lambda): I, which begins at log(init), and the sum are clipped
     between log(1e-6) and log(maximum). A step is then relative, and the same gains serve rewards and costs of any
-    size.
+    size. With a ``swing``, kp * e_s is bounded by it: swing * tanh(kp * e_s / swing).
 
     The integral is kept in units of lambda (or of its logarithm) and clipped at every step (anti-windup), so that it
     lets go as soon as the sign of the violation changes. It starts at ``init``. The derivative acts on
@@ -147,11 +147,13 @@ class PIDMultiplier(LagrangeMultiplier):
         signed: whether satisfied samples lower the multiplier; Stooke et al. do so.
         maximum: upper bound of the value and of the integral.
         smoothing: time over which e_s averages e; 0: not at all.
+        swing: bound of the proportional part, so that a policy that is far from its limit is not driven there at
+            any price; infinite by default.
         exponential: see above.
 
     Raises:
         ValueError: if a gain, ``init`` or ``smoothing`` is negative or not finite, all gains are 0,
-            ``maximum < init``, or ``init`` is below 1e-6 and ``exponential``.
+            ``maximum < init``, ``swing`` is not positive, or ``init`` is below 1e-6 and ``exponential``.
 
     Examples:
         >>> import torch
@@ -176,6 +178,7 @@ class PIDMultiplier(LagrangeMultiplier):
         signed: bool = True,
         maximum: float = math.inf,
         smoothing: float = 0.0,
+        swing: float = math.inf,
         exponential: bool = False,
     ):
         super().__init__(init, signed, maximum)
@@ -184,7 +187,10 @@ class PIDMultiplier(LagrangeMultiplier):
             raise ValueError("At least one of kp, ki and kd must be > 0, got 0, 0 and 0.")
         if exponential and init < LEAST:
             raise ValueError(f"init must be >= {LEAST} where exponential, got {init}.")
-        self.smoothing, self.exponential = _check("smoothing", smoothing), exponential
+        if not swing > 0:
+            raise ValueError(f"swing must be > 0, got {swing}.")
+        self.smoothing, self.swing = _check("smoothing", smoothing), float(swing)
+        self.exponential = exponential
         self.register_buffer("integral", self.value.log() if exponential else self.value.clone())
         self.register_buffer("previous", torch.zeros_like(self.value))
         self.register_buffer("started", torch.tensor(False))
@@ -199,7 +205,10 @@ class PIDMultiplier(LagrangeMultiplier):
         if self.exponential:
             least, most = math.log(LEAST), math.log(most)
         integral = (self.integral + self.ki * elapsed * mean).clamp(least, most)
-        value = (self.kp * smooth + integral + self.kd * rise).clamp(least, most)
+        proportional = self.kp * smooth
+        if self.swing < math.inf:
+            proportional = self.swing * (proportional / self.swing).tanh()
+        value = (proportional + integral + self.kd * rise).clamp(least, most)
         if self.exponential:
             value = value.exp()
         self.integral.copy_(torch.where(known, integral, self.integral))

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -15,27 +11,11 @@ from tensordict.utils import NestedKey
 from torchrl.data import ReplayBuffer
 
 from saferl.checkpoint.state import BufferState
+from saferl.config.machine import memory
 
 
 def _flat(data: TensorDictBase, keys: Sequence[NestedKey]) -> TensorDictBase:
     return data.select(*keys, strict=False).contiguous().reshape(-1)
-
-
-def memory(device: torch.device) -> int:
-    """Bytes that a device has in all; on a CPU not more than the process or its container may have, and no end where the
-    system does not say."""
-    if device.type == "cuda":
-        return torch.cuda.mem_get_info(device)[1]
-    try:
-        import resource
-    except ImportError:  # not a Unix
-        return sys.maxsize
-    there = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
-    if (allowed := resource.getrlimit(resource.RLIMIT_AS)[0]) != resource.RLIM_INFINITY:
-        there.append(allowed)
-    with suppress(OSError, ValueError):  # no control group, or one without a limit
-        there.append(int(Path("/sys/fs/cgroup/memory.max").read_text()))
-    return min(there)
 
 
 def check_memory(option: str, count: int, transition: TensorDictBase, device: torch.device) -> None:
@@ -51,7 +31,7 @@ def check_memory(option: str, count: int, transition: TensorDictBase, device: to
         ValueError: says how much memory they take and how much there is.
     """
     size = transition.bytes() / transition.numel()
-    there = memory(device)
+    there = torch.cuda.mem_get_info(device)[1] if device.type == "cuda" else memory()
     if count * size > there:
         raise ValueError(
             f"{option} must be <= {int(there / size)}, got {count}: a transition takes {size:,.0f} bytes, all of them "

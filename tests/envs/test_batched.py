@@ -34,8 +34,8 @@ def test_specs(task, num_envs):
     for key in ("reward", "cost"):
         assert rewards[key].shape == (num_envs, 1) and rewards[key].dtype == torch.float32
     assert set(env.observation_spec.keys()) == set(OBSERVATION)
-    assert env.observation_spec["ego"].shape == (num_envs, 17)
-    assert env.observation_spec["vehicles"].shape == (num_envs, 11, 14)
+    assert env.observation_spec["ego"].shape == (num_envs, 12)
+    assert env.observation_spec["vehicles"].shape == (num_envs, 11, 12)
     assert env.action_spec.space.low.unique().item() == -1.0
     assert env.action_spec.space.high.unique().item() == 1.0
     fresh = env.reset()

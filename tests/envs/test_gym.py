@@ -176,7 +176,14 @@ gymnasium.register("test/Engine-v0", Engine, max_episode_steps=6)
 
 def test_who_makes_an_environment_closes_it(command, tmp_path):
     """Training and closing test, each with an engine of which a process holds one."""
-    options = (*SMALL, "task=gym", "task.id=test/Engine-v0", "algo=rsac", "risk_limit=1", "env.num_envs=1")
+    options = (
+        *SMALL,
+        "task=gym",
+        "task.id=test/Engine-v0",
+        "algo=rsac",
+        "risk_limit=1",
+        "env.num_envs=1",
+    )
     command("train", "config", *options, "evaluation.num_envs=1", "out=run")
     assert (tmp_path / "run/evaluation/metrics.json").is_file() and not Engine.alive
 

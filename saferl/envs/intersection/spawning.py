@@ -16,6 +16,7 @@ from torch import Tensor
 from saferl.envs.intersection.geometry import (
     ARM,
     EXIT_DISTANCE,
+    LENGTH,
     ROUTES,
     ROUTES_OF_TASK,
     Constants,
@@ -94,6 +95,16 @@ class Traffic:
         for name in ("gap", "ego_gap"):
             if getattr(self, name) < 0:
                 raise ValueError(f"traffic.{name} must be >= 0, got {getattr(self, name)}.")
+        if self.vehicles[1] > self.room:
+            raise ValueError(
+                f"vehicles must be <= {self.room}, as many as there is room for on eight lanes of "
+                f"{self.spawn_length:g} m, got {self.vehicles[1]}."
+            )
+
+    @property
+    def room(self) -> int:
+        """How many vehicles can be drawn at once, no two of a lane closer than ``gap`` or their length."""
+        return 8 * (1 + int(self.spawn_length / max(self.gap, LENGTH)))
 
     @property
     def sensed_exactly(self) -> bool:

@@ -1,0 +1,80 @@
+"""Files that somebody else wrote: they run no code and write nowhere."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+from small import SMALL, compose
+
+from saferl.algorithms.assemble import build_trainer
+from saferl.checkpoint.run import CONFIG, run_config
+
+
+@pytest.fixture(scope="module")
+def theirs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("theirs")
+    cfg = compose(*SMALL, "algo=rsac", "task=cart", "risk_limit=1")
+    build_trainer(cfg, folder).train()
+    OmegaConf.save(cfg, folder / CONFIG, resolve=True)
+    return folder
+
+
+EVIL = [
+    ("loss._target_", "os.system"),
+    ("encoder._target_", "subprocess.run"),
+    ("encoder._target_", "builtins.exec"),
+    ("encoder._target_", "builtins.open"),
+    ("encoder.activation.path", "os.system"),
+    ("encoder.activation._target_", "hydra.utils.instantiate"),
+    ("risk._target_", "torch.load"),
+    ("risk._target_", "torch.hub.load"),
+    ("risk._target_", "saferl.checkpoint.run.export"),
+    ("risk._target_", "saferl.modules.lagrange.torch.hub.load"),
+    ("risk._target_", "saferl.envs.gym.importlib.import_module"),
+    ("projector._target_", "shutil.rmtree"),
+    ("task._target_", "numpy.load"),
+    ("env._target_", "hydra._internal.utils._locate"),
+    ("lagrange.signal._target_", "own_module.os.system"),
+    ("learning._target_", ["os.system"]),
+    ("learning._target_", {"path": "os.system"}),
+    ("task.id", "antigravity:X-v0"),
+    ("algo_name", "../../x"),
+    ("task.task", "/tmp/x"),
+    ("logger.sinks", [{"_target_": "os.system", "command": "x"}]),
+    ("logger.sinks", [{"_target_": "torchrl.record.loggers.CSVLogger", "exp_name": "../../x"}]),
+]
+
+
+@pytest.mark.parametrize(("name", "value"), EVIL)
+@pytest.mark.parametrize("option", ["checkpoint", "init", "resume"])
+def test_a_configuration_names_parts_alone(
+    name: str, value, option: str, theirs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "own_module.py").write_text("import os\n\n\nclass Part:\n    pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "own_module", raising=False)
+    cfg = OmegaConf.load(theirs / CONFIG)
+    OmegaConf.update(cfg, name, value, force_add=True)
+    (tmp_path / "policy").mkdir()
+    OmegaConf.save(cfg, tmp_path / "policy" / CONFIG)
+    with pytest.raises(ValueError, match=r"may not|must be without"):
+        run_config(tmp_path / "policy", option)
+
+
+def test_ones_own_parts_may_be_named(theirs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "own_parts.py").write_text("class Part:\n    pass\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert run_config(theirs).algo_name == "rsac"
+    cfg = OmegaConf.load(theirs / CONFIG)
+    (tmp_path / "run").mkdir()
+    for target in ("own_parts.Part", "own_parts.Missing", "packaging.version.Version"):
+        cfg.risk._target_ = target
+        OmegaConf.save(cfg, tmp_path / "run" / CONFIG)
+        monkeypatch.setenv("SAFERL_TRUST", "other,packaging")
+        assert run_config(tmp_path / "run").risk._target_ == target
+    monkeypatch.delenv("SAFERL_TRUST")
+    with pytest.raises(ValueError, match="SAFERL_TRUST=package"):
+        run_config(tmp_path / "run")
