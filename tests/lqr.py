@@ -77,7 +77,7 @@ class LQR(gymnasium.Env):
 #: A state of one and of two dimensions; a budget of effort, and one of distance.
 EFFORT = dict(A=[[1.0]], B=[[0.5]], Q=[[1.0]], R=[[0.01]], M=[[0.0]], N=[[4.0]], noise=0.2)
 DISTANCE = dict(
-    A=[[0.95, 0.2], [0.0, 0.9]], B=[[0.0], [0.3]], Q=[[0.0, 0.0], [0.0, 0.05]], R=[[2.0]],
+    A=[[0.95, 0.2], [0.0, 0.9]], B=[[0.0], [0.3]], Q=[[0.1, 0.0], [0.0, 0.05]], R=[[2.0]],
     M=[[1.0, 0.0], [0.0, 0.0]], N=[[0.0]], spread=0.5, noise=0.1,
 )  # fmt: skip
 for name, matrices in (("Effort", EFFORT), ("Distance", DISTANCE)):

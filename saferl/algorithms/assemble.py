@@ -20,12 +20,14 @@ from saferl.checkpoint.run import FOLDER, latest, load_component, run_config
 from saferl.checkpoint.state import Fitting, Networks
 from saferl.config.check import arguments, check, check_targets, check_task
 from saferl.envs.task import Task
+from saferl.training.best import BestPolicy
 from saferl.training.experience import check_memory
 from saferl.training.limit import CostWatch
 from saferl.training.progress import Budget
 from saferl.training.records import EpisodeWindow
 from saferl.training.signals import ProjectorProgress
 from saferl.training.trainer import Trainer
+from saferl.training.watchdog import Watchdog
 
 
 def build_env(
@@ -196,6 +198,8 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         learner=learner,
         window=EpisodeWindow(parts.task.outcomes),
         watch=CostWatch(cfg.cost_limit),
+        watchdog=Watchdog(agent.loss, cfg.gamma, cfg.learning.reward_scale),
+        best=BestPolicy(run, agent.loss, cfg),
         budget=Budget(cfg.episodes, cfg.frames),
         record_every=cfg.record_every,
         save_every=cfg.save_every,

@@ -15,13 +15,19 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation, GlobalRNGState
 
+from saferl.checkpoint.policy import (
+    EXPORTED,
+    policy_config,
+    policy_counted,
+    policy_state,
+    write_policy,
+)
 from saferl.checkpoint.sealed import Damaged, sealed
 from saferl.checkpoint.state import Fitting
 from saferl.config.foreign import check_origin
 
 CONFIG = "config.yaml"
 FOLDER = "checkpoints"
-EXPORTED = "policy.torchrl"
 _CPU = torch.device("cpu")
 
 
@@ -85,9 +91,13 @@ def latest(run: Path, option: str = "checkpoint") -> Path:
         raise FileNotFoundError(f"{option}: no such file or folder: {run}")
     folder = run / FOLDER
     newest = CheckpointRotation(folder, keep_last=1).latest() if folder.is_dir() else None
-    for path in (run, newest, run / EXPORTED):
+    if run.is_file():
+        return run
+    for path in (run, newest):
         if path is not None and Checkpoint.is_checkpoint(path):
             return path
+    if (run / EXPORTED).is_file():
+        return run / EXPORTED
     raise FileNotFoundError(f"{option}: {run} holds no checkpoint (looked in {folder}).")
 
 
@@ -114,15 +124,19 @@ def run_config(path: Path, option: str = "checkpoint") -> DictConfig:
     """The resolved configuration that a run was trained with.
 
     Args:
-        path: a run's folder, or a checkpoint in it.
+        path: a run's folder, a checkpoint in it, or an exported policy.
         option: what errors call it.
 
     Raises:
         FileNotFoundError: it is not there.
         ValueError: it names what a file may not call (:func:`saferl.config.foreign.check_origin`).
     """
-    file = run_folder(path, option) / CONFIG
-    cfg = OmegaConf.load(file)
+    file = path / EXPORTED if path.is_dir() else path
+    if file.is_file() and not (path / CONFIG).exists():
+        cfg = policy_config(file)
+    else:
+        file = run_folder(path, option) / CONFIG
+        cfg = OmegaConf.load(file)
     if not isinstance(cfg, DictConfig):
         raise ValueError(f"{option}: {file} holds no settings.")
     check_origin(OmegaConf.to_container(cfg, resolve=False), file)
@@ -130,12 +144,20 @@ def run_config(path: Path, option: str = "checkpoint") -> DictConfig:
 
 
 def load_component(path: Path, component: Fitting) -> None:
-    """Load one component of a checkpoint into a live module.
+    """Load one component of a checkpoint, or an exported policy, into a live module.
 
     Raises:
         ValueError: the parameters do not fit; names the first that differs.
     """
-    _load(sealed(**{component.name: component}), path)
+    if path.is_dir():
+        _load(sealed(**{component.name: component}), path)
+        return
+    # What is no tensor has no part in a policy.
+    rest = {k: v for k, v in component.state_dict().items() if not isinstance(v, torch.Tensor)}
+    try:
+        component.load_state_dict({**rest, **policy_state(path)})
+    except ValueError as error:
+        raise ValueError(f"{path} does not fit its configuration: {error}") from error
 
 
 class _Held:
@@ -148,26 +170,27 @@ class _Held:
         return self.state
 
 
-def progress(path: Path) -> dict[str, int] | None:
-    """Frames and episodes at a checkpoint; None where it does not tell.
+def progress(path: Path) -> dict[str, int]:
+    """Frames and episodes at a checkpoint.
 
     Args:
         path: a run, a checkpoint in it, or an exported policy.
     """
     path, held = latest(path), _Held()
-    if "progress" not in Checkpoint.manifest(path)["components"]:
-        return None
-    _load(sealed(progress=held), path)
-    return {name: held.state[name] for name in ("frames", "episodes")}
+    if path.is_file():
+        counted = policy_counted(path)
+    else:
+        _load(sealed(progress=held), path)
+        counted = held.state
+    return {name: int(counted[name]) for name in ("frames", "episodes")}
 
 
 def export(path: Path, folder: Path) -> Path:
-    """Write what a trained policy needs into a folder: its configuration, and one file of networks
-    with how long they were trained, by which a projector acts.
+    """Write what a trained policy needs as one file into a folder.
 
     Args:
-        path: a run, or a checkpoint in it.
-        folder: gets ``config.yaml`` and ``policy.torchrl``; ``checkpoint=`` and ``init=`` read it.
+        path: a run, a checkpoint in it, or a policy.
+        folder: gets ``policy.safetensors``; ``checkpoint=`` and ``init=`` read it.
 
     Raises:
         FileNotFoundError: ``path`` holds no run or no checkpoint.
@@ -175,11 +198,10 @@ def export(path: Path, folder: Path) -> Path:
     """
     if any((folder / name).exists() for name in (FOLDER, "metrics.csv", EXPORTED)):
         raise ValueError(f"out: {folder} holds a run or a policy already; take another folder.")
-    config = run_config(path)
-    checkpoint = sealed(loss=_Held(), progress=_Held())
-    _load(checkpoint, latest(path))
-    folder.mkdir(parents=True, exist_ok=True)
-    checkpoint.save(folder / EXPORTED, format="archive")
-    # Where the run lay is nobody else's business.
-    OmegaConf.save(OmegaConf.merge(config, {"out": None, "init": None}), folder / CONFIG)
+    found, loss = latest(path), _Held()
+    if found.is_file():
+        loss.state = policy_state(found)
+    else:
+        _load(sealed(loss=loss), found)
+    write_policy(folder, loss.state, run_config(path), progress(path))
     return folder

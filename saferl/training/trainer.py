@@ -22,10 +22,12 @@ from torchrl.record.loggers import Logger
 from saferl.checkpoint.run import RunCheckpoint
 from saferl.checkpoint.state import CollectorState, Fitting, GrowingFiles
 from saferl.evaluation.progress import bar
+from saferl.training.best import BestPolicy
 from saferl.training.learner import Learner
 from saferl.training.limit import CostWatch
 from saferl.training.progress import Budget, Clock, Progress
 from saferl.training.records import CsvLog, EpisodeWindow
+from saferl.training.watchdog import Watchdog
 
 log = logging.getLogger(__name__)
 
@@ -95,6 +97,8 @@ class Trainer:
             training starts.
         window: means over the last episodes.
         watch: of the limit on the mean cost of an episode.
+        watchdog: of the critics' values; None: they are not looked at.
+        best: keeps the best policy so far; None: only the newest checkpoint is kept.
     """
 
     run: Path
@@ -107,6 +111,8 @@ class Trainer:
     save_minutes: float | None = 5.0
     window: EpisodeWindow = field(default_factory=EpisodeWindow)
     watch: CostWatch = field(default_factory=CostWatch)
+    watchdog: Watchdog | None = None
+    best: BestPolicy | None = None
     after_collect: list[Callable[[TensorDictBase, float], None]] = field(default_factory=list)
     open_loggers: Callable[[], Sequence[Logger]] = list
 
@@ -125,8 +131,10 @@ class Trainer:
         self._count = 0
         self._loggers: Sequence[Logger] = ()
         self._saved_at = time.monotonic()
+        optional = {"watchdog": self.watchdog, "best": self.best}
         self.checkpoint = RunCheckpoint(
             self.run,
+            **{name: part for name, part in optional.items() if part is not None},
             loss=Fitting(self.learner.loss),
             optimizer=self.learner.optimizer,
             buffer=self.experience,
@@ -185,7 +193,7 @@ class Trainer:
             desc="train",
             postfix=self.window.short(self.watch.limit),
         )
-        batches = iter(self.collector)
+        batches, data = iter(self.collector), None
         with self._logging(), _interrupts() as interrupted, shown:
             if progress.last_save < 0:
                 self.experience.prepare()
@@ -197,7 +205,7 @@ class Trainer:
                     shown.set_postfix(self.window.short(self.watch.limit), refresh=False)
                 shown.update(self.budget.done(progress) - shown.n)
                 if progress.frames - progress.last_record >= self.record_every:
-                    self._record()
+                    self._record(data)
                 if self._save_is_due() and self.spent < 1.0:
                     self.save()
             if interrupted:
@@ -205,8 +213,8 @@ class Trainer:
                 raise KeyboardInterrupt(
                     f"Interrupted at frame {progress.frames}. Continue with resume={self.run}"
                 )
-            if progress.frames > progress.last_record:
-                self._record()
+            if data is not None and progress.frames > progress.last_record:
+                self._record(data)
         self.save()
         self.watch.judge(self._costs)
 
@@ -249,8 +257,9 @@ class Trainer:
                 f"{name} is not finite before the first update; look at what init= names."
             )
         return ValueError(
-            f"{name} is not finite at frame {self.progress.frames}: the training diverged. Its last good checkpoint is "
-            f"{newest}; smaller learning rates (learning.lr) may help."
+            f"{name} is not finite at frame {self.progress.frames}: the training diverged."
+            f"{self.watchdog.first() if self.watchdog else ''} Its last good checkpoint is {newest}; smaller learning rates "
+            "(learning.lr) may help."
         )
 
     def _check_finite(self) -> None:
@@ -282,6 +291,8 @@ class Trainer:
             raise self._diverged("the policy's action")
         # Of what was spent when these frames were begun: the last batch of a run is learned from, too.
         self.learner.schedule(self.spent)
+        if self.watchdog is not None:
+            self.watchdog.take(data)
         finished = self.window.extend(data)
         progress.frames += data.numel()
         progress.episodes += finished.shape[0]
@@ -301,11 +312,17 @@ class Trainer:
                 self._sums[key] = self._sums.get(key, 0.0) + value.reshape(())
         self._count += 1
 
-    def _record(self) -> None:
-        """One row of ``metrics.csv`` (no wall-clock) and one of ``timing.csv``."""
+    def _record(self, data: TensorDictBase) -> None:
+        """One row of ``metrics.csv`` (no wall-clock) and one of ``timing.csv``; a look at the critics in the states that were
+        collected last, and at whether the policy is the best so far."""
         progress = self.progress
         progress.last_record = progress.frames
         self.watch.look(self._costs, progress.frames, self.spent)
+        if self.watchdog is not None:
+            self.watchdog.look(data, progress.frames)
+        if self.best is not None:
+            counted = {"frames": progress.frames, "episodes": progress.episodes}
+            self.best.look(self.window.values, counted, self._check_finite)
         row = {
             "frames": progress.frames,
             "episodes": progress.episodes,

@@ -12,18 +12,21 @@ from pathlib import Path
 import pytest
 import torch
 from omegaconf import OmegaConf
+from safetensors.torch import save_file
 from small import EMPTY, SMALL, compose
 from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 from saferl.algorithms.assemble import build_agent, build_trainer, load_agent
+from saferl.checkpoint.policy import policy_state
 from saferl.checkpoint.run import (
     CONFIG,
     EXPORTED,
     RunCheckpoint,
     export,
     latest,
+    progress,
     run_config,
     run_folder,
 )
@@ -64,6 +67,7 @@ def test_everything_is_in_it(run: Path):
     """A peer's checkpoint held the actor alone (docs/pitfalls.md, 13)."""
     assert set(Checkpoint.manifest(latest(run))["components"]) == {
         "buffer", "clock", "collector", "files", "loss", "optimizer", "progress", "record", "rng", "watch",
+        "watchdog", "best",
         "window",
     }  # fmt: skip
     agent = build_agent(compose(*SMALL, *EMPTY, "algo=rsac"))
@@ -214,9 +218,12 @@ def test_export_destroys_nothing(run: Path, tmp_path: Path):
 
 def test_export_holds_the_networks_alone_and_drives_the_same(run: Path, tmp_path: Path):
     folder = export(run, tmp_path / "shipped" / "gs")
-    assert {path.name for path in folder.iterdir()} == {CONFIG, EXPORTED}
-    assert set(Checkpoint.manifest(folder / EXPORTED)["components"]) == {"loss", "progress"}
-    assert str(run) not in (folder / CONFIG).read_text()
+    assert [path.name for path in folder.iterdir()] == [EXPORTED]
+    assert str(run).encode() not in (folder / EXPORTED).read_bytes()
+    assert progress(folder) == progress(run) == progress(folder / EXPORTED)
+    assert run_config(folder) == run_config(folder / EXPORTED)
+    again = export(folder, tmp_path / "again") / EXPORTED
+    assert policy_state(again).keys() == policy_state(folder / EXPORTED).keys()
 
     cfg = compose(*SMALL, *EMPTY, "algo=rsac")
     ours, theirs = load_agent(cfg, run, "x"), load_agent(cfg, folder, "x")
@@ -273,11 +280,35 @@ def test_a_damaged_file_is_named_and_left_as_it_is(run: Path, tmp_path: Path, ho
     assert before == {p: p.read_bytes() for p in copy.rglob("*") if p.is_file()}
 
 
-def test_a_damaged_export_is_named(run: Path, tmp_path: Path):
-    folder = export(run, tmp_path / "policy")
-    archive = folder / EXPORTED
-    data = bytearray(archive.read_bytes())
-    data[len(data) // 2] ^= 1
-    archive.write_bytes(data)
-    with pytest.raises(ValueError, match="is damaged"):
-        load_agent(run_config(folder), folder, "checkpoint")
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.1, 0.3, 0.5, 0.9, 1.0])
+@pytest.mark.parametrize("how", ["cut", "longer", "changed", "zeros"])
+def test_a_damaged_policy_is_refused(run: Path, tmp_path: Path, how: str, share: float):
+    """Wherever it is damaged: in the sizes, the header with the configuration, or the weights."""
+    file = export(run, tmp_path / "policy") / EXPORTED
+    data = bytearray(file.read_bytes())
+    at = min(int(share * len(data)), len(data) - 1)
+    if how == "cut":
+        data = data[:at]
+    elif how == "longer":
+        data += b"\0"
+    elif how == "changed":
+        data[at] ^= 1
+    else:
+        data[at : at + 64] = bytes(len(data[at : at + 64]))
+    same = data == file.read_bytes()
+    file.write_bytes(data)
+    if same:
+        load_agent(run_config(file), file, "checkpoint")
+        return
+    with pytest.raises(ValueError, match=r"is damaged|no policy"):
+        load_agent(run_config(file), file, "checkpoint")
+    assert file.read_bytes() == data
+
+
+def test_a_file_of_another_kind_is_no_policy(tmp_path: Path):
+    (tmp_path / "x.pt").write_bytes(pickle.dumps("code"))
+    with pytest.raises(ValueError, match=r"x\.pt is damaged, or no policy"):
+        run_config(tmp_path / "x.pt")
+    save_file({"x": torch.zeros(1)}, tmp_path / "other.safetensors")
+    with pytest.raises(ValueError, match="no policy of saferl: it has no config, counted, sha256"):
+        run_config(tmp_path / "other.safetensors")
