@@ -133,9 +133,7 @@ class CartEnv(SeededEnv):
         self._state = torch.zeros(*batch, 2, device=self.device)
         self._seeds = torch.zeros(batch, dtype=torch.int64, device=self.device)
         self._steps = torch.zeros_like(self._seeds)
-        self._matrices = [
-            torch.tensor(m, dtype=torch.float32, device=self.device) for m in (_A, _B)
-        ]
+        self._matrices = [torch.tensor(m, dtype=self.real, device=self.device) for m in (_A, _B)]
         self.set_seed(seed)
 
     def _reset(
@@ -152,8 +150,8 @@ class CartEnv(SeededEnv):
         )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = tensordict.get("action").clamp(-1.0, 1.0)
         state, (A, B) = self._state, self._matrices
+        action = tensordict.get("action").to(state).clamp(-1.0, 1.0)
         reward = -(state.square() @ state.new_tensor(np.diag(_Q)).unsqueeze(-1))
         shock = (2 * uniform(self._seeds + (self._steps << 32), 2) - 1) * self.task.noise
         self._state = state @ A.T + action @ B.T

@@ -116,7 +116,7 @@ class GymEnvs(ReplayedEnv):
         device: of the tensors.
 
     Reads ``action`` [B, A] in [-1, 1], rescaled to the environment's box. Writes ``observation`` [B, size]
-    float32, ``reward`` and ``cost`` [B, 1].
+    and ``reward`` and ``cost`` [B, 1].
 
     Raises:
         ValueError: as :meth:`GymTask.make`; or, in an episode, no ``cost_key`` in ``info``, or an observation,
@@ -156,7 +156,7 @@ class GymEnvs(ReplayedEnv):
             keys += ("reward", "cost", "terminated", "truncated", "done")
         values = {key: np.stack([last[key] for last in self._last]) for key in keys}
         tensors = {key: torch.from_numpy(value) for key, value in values.items()}
-        return TensorDict(tensors, self.batch_size).to(self.device or "cpu")
+        return TensorDict(self._reals(tensors), self.batch_size).to(self.device or "cpu")
 
     def _numbers(self, **values: Any) -> dict[str, np.ndarray]:
         """Copies as float32, as some environments reuse their arrays."""

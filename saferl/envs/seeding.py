@@ -60,6 +60,7 @@ class SeededEnv(EnvBase):
 
     Attributes:
         task: as given.
+        real: of observations, rewards and costs: torch's default when the environment was made.
         kept: names of the tensors that are its state.
 
     Raises:
@@ -73,6 +74,11 @@ class SeededEnv(EnvBase):
             raise ValueError(f"num_envs must be >= 1, got {num_envs}.")
         super().__init__(device=device, batch_size=[num_envs])  # pyright: ignore[reportArgumentType]
         self.task: Any = task
+        self.real = torch.get_default_dtype()
+
+    def _reals(self, values: dict[str, Any]) -> dict[str, Any]:
+        """Numbers in the type of the specs, whatever they were computed in."""
+        return {k: v.to(self.real) if v.is_floating_point() else v for k, v in values.items()}
 
     def _make_ends(self) -> None:
         """The specs of reward, cost and the ends of episodes."""
@@ -173,6 +179,14 @@ class ReplayedEnv(SeededEnv):
             self._step_one(index, action.copy())
         return self._stack(ended=True)
 
+    def __reduce__(self) -> tuple:
+        """A copy is made anew and plays the running episodes again: simulators can rarely be copied or pickled."""
+        return _again, (type(self), self.task, self.batch_size[0], self.device, self.state_dict())
+
+    def __deepcopy__(self, memo: dict) -> ReplayedEnv:
+        function, arguments = self.__reduce__()
+        return function(*arguments)
+
     def state_dict(self, *args, **kwargs) -> dict[str, Tensor]:
         """Seeds, and the actions of the running episodes."""
         state = {**super().state_dict(), "seeds": self._seeds}
@@ -189,3 +203,9 @@ class ReplayedEnv(SeededEnv):
             self._reset_one(index)
             for action in state_dict[f"actions_{index}"].cpu().numpy():
                 self._step_one(index, action.copy())
+
+
+def _again(kind: type[ReplayedEnv], task: Any, num_envs: int, device: Any, state: Any) -> Any:
+    env: Any = kind(task, num_envs, device=device)
+    env.load_state_dict(state)
+    return env

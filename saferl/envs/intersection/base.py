@@ -278,7 +278,7 @@ class IntersectionBase(SeededEnv):
             key: value if key in ("ego", "vehicles") else value.reshape(*self.batch_size, 1)
             for key, value in values.items()
         }
-        return TensorDict(out, batch_size=self.batch_size, device=self.device)
+        return TensorDict(self._reals(out), batch_size=self.batch_size, device=self.device)
 
     def snapshot(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """States of the ego [6] and of the others [N, 6] of one environment, float64.

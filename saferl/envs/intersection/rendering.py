@@ -51,6 +51,11 @@ class Renderer:
         self.surface.centering_position = [0.5, 0.5]
         self.surface.move_display_window_to(np.zeros(2))
         self._background: Any = None
+        self._made = size, view
+
+    def __reduce__(self) -> tuple:
+        """A copy has a surface of its own."""
+        return Renderer, self._made
 
     def _draw_background(self, road: IntersectionRoad) -> Any:
         import pygame
