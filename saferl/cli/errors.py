@@ -53,6 +53,8 @@ def explain(error: Exception, config: str = "config", arguments: list[str] | Non
     # Of a run's own file, which somebody has edited.
     if found := re.match(r"Key '(.*?)' not in '.*?' full_key: (\S+)", message):
         return f"unknown key {found[2]}; {_hint(found[1], _beside(found[2], config))}"
+    if found := re.search(r"interpolation: Missing mandatory value: (\S+)", message):
+        return f"{found[1]} is missing."
     if found := re.match(r"Missing (?:mandatory value:|key) .*? full_key: (\S+)", message):
         return f"{found[1]} is missing."
     if isinstance(error, HydraException):

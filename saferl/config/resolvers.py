@@ -60,3 +60,16 @@ def pays_to_compile(episodes: int | None, frames: int | None) -> bool:
 
 # ${pays_to_compile:${episodes},${frames}}
 OmegaConf.register_new_resolver("pays_to_compile", pays_to_compile, replace=True)
+
+
+def env_name(identity: str) -> str:
+    """What runs on an environment are called: its name without module and name space.
+
+    >>> env_name("my_envs:space/Walk-v0")
+    'Walk-v0'
+    """
+    return identity.replace(":", "/").rpartition("/")[2]
+
+
+# ${env_name:${task.id}}
+OmegaConf.register_new_resolver("env_name", env_name, replace=True)

@@ -18,6 +18,7 @@ import torch
 from gymnasium.spaces import Box
 from gymnasium.wrappers import FlattenObservation, RescaleAction
 from tensordict import TensorDict
+from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
 
 from saferl.envs.seeding import ReplayedEnv
@@ -36,6 +37,8 @@ class GymTask(Task):
         kwargs: of the environment.
         size, action_dim: numbers of an observation and of an action: the environment's own.
         horizon: decisions of an episode at most, in place of the environment's own limit; None: that one.
+        seeds: (first, count) of the numbers of scenarios that training resets with; None: any number of 31 bits.
+        test_seeds: likewise of tests, which play them one after the other; None: as many, after those of training.
         task: what runs are called.
 
     Raises:
@@ -48,11 +51,38 @@ class GymTask(Task):
     size: int | None = None
     action_dim: int | None = None
     horizon: int | None = None
+    seeds: tuple[int, int] | None = None
+    test_seeds: tuple[int, int] | None = None
     task: str = "gym"
 
     def __post_init__(self):
+        for name in ("seeds", "test_seeds"):
+            numbers = getattr(self, name)
+            if numbers is not None:
+                first, count = numbers
+                if first < 0 or count < 1 or first + count > 2**31:
+                    raise ValueError(
+                        f"task.{name} must be [first, count] with first >= 0 and count >= 1, all below 2**31, got "
+                        f"{list(numbers)}."
+                    )
+        if self.test_seeds is not None and self.seeds is None:
+            raise ValueError("task.test_seeds needs task.seeds, got null.")
         if self.horizon is not None and self.horizon < 1:
             raise ValueError(f"task.horizon must be null or >= 1, got {self.horizon}.")
+
+    @property
+    def in_tests(self) -> Mapping[str, Any]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Other scenarios than in training."""
+        if self.seeds is None:
+            return {}
+        first, count = self.seeds
+        return {"seeds": self.test_seeds or (first + count, count)}
+
+    def episodes(self, seed: int, count: int) -> Tensor:
+        if self.seeds is None:
+            return super().episodes(seed, count)
+        first, several = self.seeds
+        return first + torch.arange(count) % several
 
     def make(self) -> gymnasium.Env:
         """One environment as it is, but for its time limit, which :class:`GymEnvs` keeps.
@@ -115,7 +145,7 @@ class GymEnvs(ReplayedEnv):
         seed: of the sequences of episodes; None: others each time.
         device: of the tensors.
 
-    Reads ``action`` [B, A] in [-1, 1], rescaled to the environment's box. Writes ``observation`` [B, size]
+    Reads ``action`` [B, A] in [-1, 1], rescaled to the environment's box. Writes ``observation`` [B, size], flat, pixels in [0, 1],
     and ``reward`` and ``cost`` [B, 1].
 
     Raises:
@@ -142,6 +172,8 @@ class GymEnvs(ReplayedEnv):
         ] = []  # those that are there can be closed where the next one fails
         for _ in range(num_envs):
             self.envs.append(self._make())
+        # Bytes are pixels.
+        self._unit = 255.0 if self.envs[0].observation_space.dtype == np.uint8 else 1.0
         self.set_seed(seed)
 
     def _make(self) -> gymnasium.Env:
@@ -166,14 +198,22 @@ class GymEnvs(ReplayedEnv):
                 raise ValueError(f"task.id: {self.task.id} gave {key}={value}.")
         return found
 
+    def _next_seeds(self, reset: Tensor, seeds: Tensor | None = None) -> Tensor:
+        found = super()._next_seeds(reset, seeds)
+        if seeds is not None or self.task.seeds is None:
+            return found
+        first, count = self.task.seeds
+        return first + found % count
+
     def _start(self, index: int, seed: int) -> dict[str, Any]:
         observation, _ = self.envs[index].reset(seed=seed)
-        return self._numbers(observation=observation)
+        return self._numbers(observation=observation / self._unit)
 
     def _advance(self, index: int, action: np.ndarray) -> dict[str, Any]:
         observation, reward, terminated, truncated, info = self.envs[index].step(action)
         truncated = truncated or len(self._actions[index]) >= self.horizon
         ends = {"terminated": terminated, "truncated": truncated, "done": terminated or truncated}
+        observation = observation / self._unit
         numbers = self._numbers(observation=observation, reward=[reward], cost=[info[_COST]])
         return {**numbers, **{key: np.array([end], bool) for key, end in ends.items()}}
 

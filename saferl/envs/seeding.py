@@ -6,7 +6,7 @@ No generator is shared: what happens in an episode follows from its own 31-bit s
 from __future__ import annotations
 
 import secrets
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -15,7 +15,9 @@ from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from saferl.envs.task import Task
+if TYPE_CHECKING:  # a task asks for seeds
+    from saferl.envs.task import Task
+
 
 _MIX = (-7046029254386353131, -4658895280553007687, -7723592293110705685)
 U31 = 0x7FFFFFFF

@@ -12,6 +12,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from saferl.envs.seeding import episode_seeds
+
 
 class Task:
     """Base of a task's settings, which are a frozen dataclass.
@@ -65,6 +67,15 @@ class Task:
             for key, value in self.in_tests.items()
         }
         return dataclasses.replace(self, **changes)  # pyright: ignore[reportArgumentType]
+
+    def episodes(self, seed: int, count: int) -> Tensor:
+        """The seeds [count] of a test's episodes.
+
+        Args:
+            seed: of the test.
+            count: of episodes.
+        """
+        return episode_seeds(seed, count)
 
     def check_policy_of(self, trained: Self) -> None:
         """Refuse a policy that was trained on other observations than these.

@@ -13,7 +13,6 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from saferl.envs.seeding import episode_seeds
 from saferl.envs.task import Task
 from saferl.evaluation.progress import bar
 from saferl.evaluation.rows import episode_rows
@@ -73,8 +72,8 @@ def evaluate(
 ) -> list[dict]:
     """Play ``episodes`` episodes; returns one row of figures an episode.
 
-    An episode is a function of its own seed, which follows from ``seed`` and its number, so that the
-    number of environments changes nothing but the speed.
+    An episode is a function of its own seed, which follows from ``seed`` and its number (:meth:`Task.episodes`), so
+    that the number of environments changes nothing but the speed.
 
     Raises:
         ValueError: fewer than one episode.
@@ -82,7 +81,7 @@ def evaluate(
     if episodes < 1:
         raise ValueError(f"episodes must be >= 1, got {episodes}.")
     width, task = env.batch_size[0], cast(Task, env.task)
-    seeds = episode_seeds(seed, -(-episodes // width) * width)
+    seeds = task.episodes(seed, -(-episodes // width) * width)
     rows: list[dict] = []
     with bar(total=episodes, desc="test", unit="episode", disable=not progress) as shown:
 
