@@ -38,13 +38,13 @@ class CPOLoss(CostValueMixin, PPOLoss):
     .. math::
 
         L_V &= E[(V(s) - G)^2], \quad L_c = E[\tfrac12 (V_c(s) - G_c)^2] \\
-        \max_x\; & g^T x \quad \text{such that} \quad (J_c - d) / L + b^T x \le 0, \quad
+        \max_x\; & g^T x \quad \text{such that} \quad (J_c - d + m) / L + b^T x \le 0, \quad
         \tfrac12 x^T H x \le \delta
 
     with :math:`G` and :math:`G_c` the value targets, TD(lambda). The first line is :meth:`forward`, for mini-batches. The
     second is :class:`~saferl.objectives.TrustRegionStep`, once for each whole batch, after :meth:`begin`:
     ``loss.policy_step().step(data)``. The loss has what it needs: :meth:`policy`, :meth:`surrogates` (whose gradients
-    are g and b), :meth:`cost_of_policy` (:math:`J_c` and :math:`L`) and the settings.
+    are g and b), :meth:`cost_of_policy` (:math:`J_c` and :math:`L`), the margin m and the settings.
 
     Args:
         actor_network (ProbabilisticTensorDictSequential): the policy.
@@ -58,6 +58,9 @@ class CPOLoss(CostValueMixin, PPOLoss):
         damping (float, optional): added to H's diagonal. Defaults to ``0.1``.
         search_steps (int, optional): how often a step is shortened at most. Defaults to ``15``.
         backtrack (float, optional): factor of each shortening. Defaults to ``0.8``.
+        margin_rate (float, optional): the share of an excess :math:`J_c - d` by which every step lowers the limit that
+            the following ones keep (ours); a shortage raises it again, up to d. Where b is noisy, steps along the
+            boundary that it seems to have end outside, all of them. Defaults to ``0.0``, as published.
         critic_coeff, loss_critic_type, separate_losses, reduction: as in
             :class:`~torchrl.objectives.PPOLoss`. Default here: ``loss_critic_type="l2"``.
 
@@ -108,6 +111,7 @@ class CPOLoss(CostValueMixin, PPOLoss):
     input_entries = ("value_target", "cost_value_target")
 
     cost_limit: Tensor
+    margin: Tensor
     report: Tensor
 
     def __init__(
@@ -122,6 +126,7 @@ class CPOLoss(CostValueMixin, PPOLoss):
         damping: float = 0.1,
         search_steps: int = 15,
         backtrack: float = 0.8,
+        margin_rate: float = 0.0,
         critic_coeff: float = 1.0,
         loss_critic_type: Literal["l1", "l2", "smooth_l1"] = "l2",
         separate_losses: bool = False,
@@ -133,6 +138,8 @@ class CPOLoss(CostValueMixin, PPOLoss):
         for name, value in (("cg_steps", cg_steps), ("search_steps", search_steps)):
             if value < 1:
                 raise ValueError(f"{name} must be >= 1, got {value}.")
+        if not 0 <= margin_rate <= 1:
+            raise ValueError(f"margin_rate must be in [0, 1], got {margin_rate}.")
         if not 0 < backtrack < 1:
             raise ValueError(f"backtrack must be in (0, 1), got {backtrack}.")
         super().__init__(
@@ -152,6 +159,8 @@ class CPOLoss(CostValueMixin, PPOLoss):
         self.out_keys += ["step_fraction", *(f"cpo_{name}" for name in CASES)]
         self.trust, self.cg_steps, self.damping = trust, cg_steps, damping
         self.search_steps, self.backtrack = search_steps, backtrack
+        self.margin_rate = margin_rate
+        self.register_buffer("margin", torch.zeros_like(self.cost_limit))
         # Of the last step, which writes it: KL, J_c, fraction of the step, number of the case.
         self.register_buffer("report", torch.full((4,), torch.nan, device=device))
         self.episodes = EpisodeCost().to(device)

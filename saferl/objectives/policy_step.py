@@ -25,6 +25,8 @@ class Constrained(Protocol):
 
     actor_network_params: TensorDictParams
     cost_limit: Tensor
+    margin: Tensor
+    margin_rate: float
     report: Tensor
     trust: float
     damping: float
@@ -52,7 +54,7 @@ class TrustRegionStep:
     - :math:`g` and :math:`b` are the gradients of :meth:`CPOLoss.surrogates <saferl.objectives.CPOLoss.surrogates>`,
       of reward and cost.
     - :math:`H` is the Fisher matrix of the policy, damped.
-    - :math:`c = (J_c - d) / L` is the violation *per decision*, from the cost of an episode and its decisions,
+    - :math:`c = (J_c - d + m) / L` is the violation *per decision*, from the cost of an episode and its decisions,
       :meth:`CPOLoss.cost_of_policy <saferl.objectives.CPOLoss.cost_of_policy>`. g and b are means over decisions, and
       :math:`J_c(\pi') - J_c(\pi)` is to first order :math:`L` times such a mean.
 
@@ -105,7 +107,9 @@ class TrustRegionStep:
             tensordict: ``[*B, T]`` as the loss's ``begin`` leaves it.
         """
         cost, decisions = self.loss.cost_of_policy(tensordict)
-        violation = float((cost - self.loss.cost_limit) / decisions)
+        loss, excess = self.loss, cost - self.loss.cost_limit
+        violation = float((excess + loss.margin) / decisions)
+        loss.margin.add_(loss.margin_rate * excess).clamp_(min=0.0).clamp_(max=loss.cost_limit)
         kl, fraction, case = self.move(tensordict.reshape(-1), violation)
         self.loss.report.copy_(torch.tensor([kl, float(cost), fraction, CASES.index(case)]))
 

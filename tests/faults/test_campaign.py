@@ -1,0 +1,252 @@
+"""Trainings to which something happens: killed, without room, without their folder, told to stop while they save.
+
+Each is a child of this process, forked, so that hundreds of them need no imports. What is promised: none hangs, none loses a
+good checkpoint, none shows a bare trace, and a run that can go on ends as if nothing had happened, bit for bit.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import resource
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from small import SMALL, fitting
+
+from saferl.checkpoint import sealed
+from saferl.checkpoint.run import FOLDER, latest
+from saferl.cli.launch import launch
+
+pytestmark = pytest.mark.slow
+
+LIMIT = 120  # seconds after which a child hangs
+PROJECTOR = ("projector.start=0", "projector.steps=3", "risk_limit=0", "task.duration=2")
+OFF = (*SMALL, "algo=rsac", "task.vehicles=3", *PROJECTOR, "frames=120", "save_every=8")
+ON = (*SMALL, "algo=arppo", "task.vehicles=3", *PROJECTOR, "frames=120", "save_every=8")
+BACKENDS = {"batched": (), "highway": ("env=highway",)}
+RUNS = {
+    f"{name} {backend}": (*options, *extra)
+    for name, options in (("off-policy", OFF), ("on-policy", ON))
+    for backend, extra in BACKENDS.items()
+}
+
+
+def begin(folder: Path, arguments: Sequence[str], sabotage: Callable[[], object] = int) -> int:
+    """A child that runs a training in a folder, after ``sabotage``; its output goes to ``folder/said``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    if (child := os.fork()) != 0:
+        return child
+    status = 70
+    try:
+        os.chdir(folder)
+        said = os.open("said", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        os.dup2(said, 1)
+        os.dup2(said, 2)
+        torch.set_num_threads(1)
+        random.seed(0)  # which a process of its own has from the system, and no run uses
+        np.random.seed(0)  # noqa: NPY002
+        sys.argv = ["saferl", *fitting(arguments)]
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.default_int_handler)
+        sabotage()
+        launch("train", "config")
+        status = 0
+    except SystemExit as end:
+        if isinstance(end.code, str):
+            os.write(2, f"{end.code}\n".encode())
+        status = end.code if isinstance(end.code, int) else 1
+    except BaseException:
+        import traceback
+
+        os.write(2, traceback.format_exc().encode())
+    finally:
+        os._exit(status)
+
+
+def ended(child: int) -> int:
+    """The exit status of a child, negative for a signal; fails where it hangs."""
+    until = time.monotonic() + LIMIT
+    while time.monotonic() < until:
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done:
+            return os.waitstatus_to_exitcode(status)
+        time.sleep(0.005)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    pytest.fail("it hangs")
+
+
+def said(folder: Path) -> str:
+    text = (folder / "said").read_text(errors="replace") if (folder / "said").exists() else ""
+    assert "Traceback" not in text, text[-3000:]
+    return text
+
+
+def finish(folder: Path, arguments: Sequence[str]) -> None:
+    """Continue the run in ``folder/run`` to its end, or begin it where nothing is there to continue."""
+    run = folder / "run"
+    if (run / FOLDER).is_dir():
+        arguments = ["resume=run"]
+    else:
+        shutil.rmtree(run, ignore_errors=True)
+        arguments = [*arguments, "out=run"]
+    assert ended(begin(folder, arguments)) == 0, said(folder)
+
+
+def result(run: Path) -> dict[str, bytes]:
+    """What a run left, but for its wall-clock, its configuration's place and its logs."""
+    found = {name: (run / name).read_bytes() for name in ("metrics.csv", "evaluation/episodes.csv")}
+    for path in sorted(latest(run).rglob("*")):
+        name = path.relative_to(run).as_posix()
+        if path.is_file() and "-clock/" not in name and "-files/" not in name:
+            found[name] = path.read_bytes()
+    return {k: v for k, v in found.items() if not k.endswith(("manifest.json", "seal.json"))}
+
+
+@pytest.fixture(scope="module", params=RUNS)
+def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory):
+    """The arguments of a run, and what it leaves when nothing happens to it."""
+    folder = tmp_path_factory.mktemp("whole")
+    began = time.monotonic()
+    assert ended(begin(folder, (*RUNS[request.param], "out=run"))) == 0, said(folder)
+    return RUNS[request.param], result(folder / "run"), time.monotonic() - began
+
+
+def at_save(number: int, action: Callable[[], object]) -> Callable[[], None]:
+    """A saboteur: something happens at the n-th part of a checkpoint that is written."""
+
+    def sabotage() -> None:
+        count, save = [0], sealed.Sealed.save
+
+        def counting(self, *args, **kwargs):
+            count[0] += 1
+            if count[0] == number:
+                action()
+            return save(self, *args, **kwargs)
+
+        sealed.Sealed.save = counting
+
+    return sabotage
+
+
+def test_kills_at_random_moments(whole, tmp_path: Path):
+    """Twenty times, each run killed once or more, and then continued."""
+    arguments, expected, seconds = whole
+    draw = random.Random(0)
+    for number in range(20):
+        folder = tmp_path / str(number)
+        child = begin(folder, (*arguments, "out=run"))
+        time.sleep(draw.uniform(0.1, seconds))
+        os.kill(child, signal.SIGKILL)
+        ended(child)
+        if (folder / "run" / FOLDER).is_dir() and draw.random() < 0.5:  # and once more
+            child = begin(folder, ["resume=run"])
+            time.sleep(draw.uniform(0.1, seconds))
+            os.kill(child, signal.SIGKILL)
+            ended(child)
+        finish(folder, arguments)
+        assert result(folder / "run") == expected, number
+        said(folder)
+        shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 9, 13, 14, 20, 27, 40, 55])
+@pytest.mark.parametrize("blow", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
+def test_signals_in_the_middle_of_a_save(blow: signal.Signals, number: int, tmp_path: Path):
+    arguments = RUNS["off-policy batched"]
+    assert ended(begin(tmp_path / "whole", (*arguments, "out=run"))) == 0
+    strike = at_save(number, lambda: os.kill(os.getpid(), blow))
+    status = ended(begin(tmp_path, (*arguments, "out=run"), strike))
+    assert status == (-9 if blow == signal.SIGKILL else 130), said(tmp_path)
+    finish(tmp_path, arguments)
+    assert result(tmp_path / "run") == result(tmp_path / "whole/run")
+
+
+@pytest.mark.parametrize("size", [0, 1, 100, 1000, 4000, 10_000, 30_000, 60_000, 100_000, 200_000])
+def test_no_room_on_the_disk(size: int, tmp_path: Path):
+    """No file may grow beyond a size: one line, the last good checkpoint stays, and with room the run goes on."""
+    arguments = RUNS["off-policy batched"]
+    assert ended(begin(tmp_path / "whole", (*arguments, "out=run"))) == 0
+
+    def cramped() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        # After the first checkpoint, so that there is something to lose.
+        at_save(13, lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size)))()
+
+    status = ended(begin(tmp_path, (*arguments, "out=run"), cramped))
+    text = said(tmp_path)
+    assert status == 0 or (status == 1 and "error:" in text.splitlines()[-1]), text
+    if status:
+        assert latest(tmp_path / "run").exists()
+    finish(tmp_path, arguments)
+    assert result(tmp_path / "run") == result(tmp_path / "whole/run")
+
+
+@pytest.mark.parametrize("number", [1, 2, 5, 12, 13, 18, 25, 30, 44, 60])
+def test_a_folder_that_vanishes(number: int, tmp_path: Path):
+    """The run is lost with its folder; it says so in a line, or goes on in a new one."""
+    arguments = RUNS["off-policy batched"]
+    gone = at_save(number, lambda: shutil.rmtree("run"))
+    status = ended(begin(tmp_path, (*arguments, "out=run"), gone))
+    text = said(tmp_path)
+    assert status == 0 or (status == 1 and "error:" in text.splitlines()[-1]), text
+
+
+@pytest.mark.parametrize("moment", range(10))
+def test_a_second_process(moment: int, tmp_path: Path):
+    """It is refused while the first works, which ends as if alone."""
+    arguments = RUNS["off-policy batched"]
+    assert ended(begin(tmp_path / "whole", (*arguments, "out=run"))) == 0
+    first = begin(tmp_path, (*arguments, "out=run"))
+    while not (tmp_path / "run" / FOLDER).is_dir():
+        time.sleep(0.005)
+    time.sleep(0.02 * moment)
+    second = ["resume=run"] if moment % 2 else [*arguments, "out=run"]
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/run").symlink_to(tmp_path / "run")
+    assert ended(begin(tmp_path / "other", second)) == 1
+    assert "works on" in said(tmp_path / "other") or "holds a run already" in said(
+        tmp_path / "other"
+    )
+    assert ended(first) == 0, said(tmp_path)
+    assert result(tmp_path / "run") == result(tmp_path / "whole/run")
+
+
+@pytest.mark.parametrize("jump", [-1e9, -3600, -60, -1, 0, 1, 60, 3600, 1e9, "back and forth"])
+def test_a_clock_that_jumps(jump, tmp_path: Path):
+    """What is learned does not depend on the clock."""
+    arguments = [a for a in RUNS["off-policy batched"] if not a.startswith("save_every")]
+    arguments += ["save_every=8"]
+    assert ended(begin(tmp_path / "whole", (*arguments, "out=run"))) == 0
+    now, calls = time.time, [0]
+
+    def jumping() -> float:
+        calls[0] += 1
+        by = (-1) ** calls[0] * 1e6 if isinstance(jump, str) else jump * (calls[0] > 5)
+        return now() + by
+
+    def sabotage() -> None:
+        time.time = jumping
+
+    assert ended(begin(tmp_path, (*arguments, "out=run"), sabotage)) == 0, said(tmp_path)
+    assert result(tmp_path / "run") == result(tmp_path / "whole/run")
+
+
+def test_a_folder_that_may_not_be_written(tmp_path: Path):
+    """Refused before anything starts; as root may write everywhere, the folder is a file or lies below one."""
+    arguments = RUNS["off-policy batched"]
+    (tmp_path / "file").write_text("mine")
+    for out in ("file", "file/run", "file/a/b", "/proc/run", "/proc/1/run"):
+        status = ended(begin(tmp_path, (*arguments, f"out={out}")))
+        assert status == 1, out
+        last = said(tmp_path).splitlines()[-1]
+        assert last.startswith("error:"), last
+    assert (tmp_path / "file").read_text() == "mine"
