@@ -52,7 +52,7 @@ def begin(folder: Path, arguments: Sequence[str], sabotage: Callable[[], object]
         os.dup2(said, 2)
         torch.set_num_threads(1)
         random.seed(0)  # which a process of its own has from the system, and no run uses
-        np.random.seed(0)  # noqa: NPY002
+        np.random.seed(0)
         sys.argv = ["saferl", *fitting(arguments)]
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.default_int_handler)
