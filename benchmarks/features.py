@@ -25,12 +25,8 @@ BLANK = 1e9
 #: Whose features, and which.
 GROUPS: dict[str, tuple[str, tuple[str, ...]]] = {
     "nothing": ("ego", ()),
-    "the second line": ("ego", ("offset_other", "heading_other")),
-    "the line ahead": ("ego", ("ahead_4", "ahead_8", "ahead_16")),
     "the conflict": ("vehicle", ("conflict_s", "conflict_t", "lead")),
     "the closest approach": ("vehicle", ("closest", "closest_t")),
-    "yaw rates": ("vehicle", ("omega",)),
-    "near": ("vehicle", ("near",)),
 }
 
 
