@@ -175,3 +175,62 @@ def test_update_needs_no_graph():
 def test_errors(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def controlled(errors, times, **settings):
+    """The recursion of an exponential PID multiplier in plain floats."""
+    kp, ki, kd, smoothing, swing = (
+        settings[name] for name in ("kp", "ki", "kd", "smoothing", "swing")
+    )
+    integral, smooth, values = math.log(settings["init"]), None, []
+    for error, elapsed in zip(errors, times, strict=True):
+        weight = 1 - math.exp(-elapsed / smoothing) if smoothing else 1.0
+        before = smooth
+        smooth = error if before is None else before + weight * (error - before)
+        rise = 0.0 if before is None else max(smooth - before, 0.0)
+        integral = max(integral + ki * elapsed * error, math.log(1e-6))
+        control = swing * math.tanh(kp * smooth / swing) + integral + kd * rise
+        values.append(math.exp(max(control, math.log(1e-6))))
+    return values
+
+
+@pytest.mark.parametrize("kd", [0.0, 2.0])
+@pytest.mark.parametrize("smoothing", [0.0, 0.05])
+def test_exponential_control(kd: float, smoothing: float):
+    """As a recursion in plain floats, over violations and times of all sizes; the value stays positive."""
+    settings = dict(kp=8.0, ki=15.0, kd=kd, smoothing=smoothing, swing=1.5, init=0.5)
+    generator = torch.Generator().manual_seed(0)
+    errors = (torch.randn(60, generator=generator) - 0.3).tolist() + [-1.0] * 40
+    times = (torch.rand(100, generator=generator) * 0.05).tolist()
+    multiplier, found = PIDMultiplier(exponential=True, **settings), []
+    for error, elapsed in zip(errors, times, strict=True):
+        multiplier.update(torch.tensor([error, error]), elapsed)
+        found.append(float(multiplier.value))
+    assert found == pytest.approx(controlled(errors, times, **settings), rel=1e-5)
+    assert found[-1] >= 1e-6
+
+
+def test_a_longer_time_is_several_short_ones():
+    """Of the integral; and the size of the rewards does not matter to an exponential multiplier."""
+    once, thrice, large = (
+        PIDMultiplier(kp=0, ki=2.0, kd=0, init=init, exponential=True) for init in (1.0, 1.0, 1e3)
+    )
+    once.update(torch.tensor(0.4), elapsed=0.3)
+    large.update(torch.tensor(0.4), elapsed=0.3)
+    for _ in range(3):
+        thrice.update(torch.tensor(0.4), elapsed=0.1)
+    assert float(once.value) == pytest.approx(float(thrice.value)) == pytest.approx(math.exp(0.24))
+    assert float(large.value) == pytest.approx(1e3 * float(once.value))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"exponential": True}, "init must be >= 1e-06 where exponential, got 0.0"),
+        ({"swing": 0.0}, "swing must be > 0, got 0.0"),
+        ({"smoothing": -1.0}, "smoothing must be finite and >= 0, got -1.0"),
+    ],
+)
+def test_control_refuses(settings, message: str):
+    with pytest.raises(ValueError, match=message):
+        PIDMultiplier(**settings)

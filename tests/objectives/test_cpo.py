@@ -114,6 +114,24 @@ def test_the_violation_is_stated_per_decision():
     assert given == [pytest.approx((sum(map(sum, ended)) / 2 - 1.2) / 3.5, rel=1e-5)]
 
 
+def test_the_margin_grows_with_what_steps_exceed():
+    """By its share of each excess, down again with a shortage, between 0 and the limit; none as published."""
+    loss, actor = build("cpo", cost_limit=1.0, margin_rate=0.5)
+    step, given = loss.policy_step(), []
+    step.move = lambda batch, violation: given.append(violation) or (0.0, 0.0, "feasible")
+    data = batch_of(actor)
+    loss.begin(data)
+    course, margin, expected = [1.4, 1.8, 5.0, 0.0, 0.0], 0.0, []
+    for cost in course:
+        loss.cost_of_policy = lambda data, cost=cost: (torch.tensor(cost), torch.tensor(4.0))
+        step.step(data)
+        expected.append((cost - 1.0 + margin) / 4)
+        margin = min(max(margin + 0.5 * (cost - 1.0), 0.0), 1.0)
+        assert float(loss.margin) == pytest.approx(margin)
+    assert given == pytest.approx(expected) and "margin" in loss.state_dict()
+    assert float(build("cpo")[0].margin_rate) == 0.0
+
+
 @pytest.mark.parametrize(
     ("case", "violation", "step", "taken"),
     [

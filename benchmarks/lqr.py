@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -80,5 +82,21 @@ DISTANCE = dict(
     A=[[0.95, 0.2], [0.0, 0.9]], B=[[0.0], [0.3]], Q=[[0.1, 0.0], [0.0, 0.05]], R=[[2.0]],
     M=[[1.0, 0.0], [0.0, 0.0]], N=[[0.0]], spread=0.5, noise=0.1,
 )  # fmt: skip
-for name, matrices in (("Effort", EFFORT), ("Distance", DISTANCE)):
-    gymnasium.register(f"{name}-v0", LQR, max_episode_steps=HORIZON, kwargs=matrices)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A constrained problem: its matrices, and the limit on an episode's cost."""
+
+    matrices: dict[str, Any]
+    limit: float
+
+    @property
+    def best(self) -> float:
+        """The best return under the limit."""
+        return LQR(**self.matrices).optimum(self.limit)[0]
+
+
+PROBLEMS = {"Effort": Problem(EFFORT, 20.0), "Distance": Problem(DISTANCE, 6.0)}
+for name, problem in PROBLEMS.items():
+    gymnasium.register(f"{name}-v0", LQR, max_episode_steps=HORIZON, kwargs=problem.matrices)
