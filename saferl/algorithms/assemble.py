@@ -16,7 +16,7 @@ from torchrl.envs.transforms import Compose
 
 from saferl.algorithms.base import Agent, Algorithm
 from saferl.algorithms.parts import Parts, make
-from saferl.checkpoint.run import FOLDER, latest, load_component, run_config
+from saferl.checkpoint.run import begun, latest, load_component, run_config
 from saferl.checkpoint.state import Fitting, Networks
 from saferl.config.check import arguments, check, check_targets, check_task
 from saferl.envs.task import Task
@@ -169,7 +169,7 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
     check_task(cfg.evaluation, parts.task)
     algorithm.check_collecting(parts.task, num_envs)
     agent = algorithm.agent(parts)
-    if cfg.init and not (run / FOLDER).exists():  # a run that goes on has its own networks
+    if cfg.init and not begun(run):  # a run that goes on has its own networks
         begin_from(agent, algorithm.architecture(parts), Path(cfg.init), cfg.device)
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
     transforms: list[Any] = [sums, *algorithm.transforms()]

@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
@@ -52,8 +54,8 @@ def write_policy(
         if isinstance(value, Tensor)
     }
     # Where the run lay is nobody else's business.
-    settings = OmegaConf.merge(cfg, {"out": None, "init": None, "resume": None})
-    config, numbers = OmegaConf.to_yaml(settings), json.dumps(dict(counted))
+    mine = OmegaConf.merge(cfg, {"out": None, "init": None, "resume": None})
+    config, numbers = OmegaConf.to_yaml(mine, resolve=True), json.dumps(dict(counted))
     about = {_CONFIG: config, _COUNTED: numbers}
     about |= {_CHECKSUM: _checksum(tensors, config, numbers), "format": "saferl 1"}
     folder.mkdir(parents=True, exist_ok=True)
@@ -80,16 +82,34 @@ def _header(file: Path) -> dict[str, str]:
     return about
 
 
+def settings(text: str, file: Path) -> DictConfig:
+    """A configuration from its text.
+
+    Raises:
+        ValueError: it is none; names the file.
+    """
+    try:
+        plain = yaml.safe_load(text)
+        cfg = OmegaConf.create(text) if isinstance(plain, dict) else None
+    except (yaml.YAMLError, OmegaConfBaseException) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{file} cannot be read: {reason}.") from error
+    if not isinstance(cfg, DictConfig):
+        raise ValueError(f"{file} holds no settings.")
+    for group in ("task", "env", "loss", "encoder", "learning"):
+        if not isinstance(cfg.get(group), DictConfig):
+            raise ValueError(f"{file}: {group} must be a mapping of settings.")
+    return cfg
+
+
 def policy_config(file: Path) -> DictConfig:
     """The configuration that a policy was trained with.
 
     Raises:
         ValueError: the file is damaged, or no policy.
     """
-    cfg = OmegaConf.create(_header(file)[_CONFIG])
-    if not isinstance(cfg, DictConfig):
-        raise ValueError(f"{file} is damaged: it holds no settings.")
-    return cfg
+    policy_state(file)  # whose checksum is of the configuration, too
+    return settings(_header(file)[_CONFIG], file)
 
 
 def policy_counted(file: Path) -> dict[str, float]:
@@ -98,7 +118,11 @@ def policy_counted(file: Path) -> dict[str, float]:
     Raises:
         ValueError: the file is damaged, or no policy.
     """
-    return json.loads(_header(file)[_COUNTED])
+    try:
+        counted = json.loads(_header(file)[_COUNTED])
+        return {**counted, "frames": int(counted["frames"]), "episodes": int(counted["episodes"])}
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{file} is damaged: it does not say how long it was trained.") from error
 
 
 def policy_state(file: Path) -> dict[str, Tensor]:

@@ -20,6 +20,7 @@ from saferl.checkpoint.policy import (
     policy_config,
     policy_counted,
     policy_state,
+    settings,
     write_policy,
 )
 from saferl.checkpoint.sealed import Damaged, sealed
@@ -75,6 +76,12 @@ def _load(checkpoint: Checkpoint, path: Path) -> None:
             f"checkpoint {path} does not fit this configuration: {error.__cause__ or error} "
             f"Use the configuration that it was trained with ({CONFIG} in its run)."
         ) from error
+
+
+def begun(run: Path) -> bool:
+    """Whether a run's folder holds a whole checkpoint: one that was killed before its first has nothing to go on from."""
+    folder = run / FOLDER
+    return folder.is_dir() and CheckpointRotation(folder, keep_last=1).latest() is not None
 
 
 def latest(run: Path, option: str = "checkpoint") -> Path:
@@ -136,9 +143,7 @@ def run_config(path: Path, option: str = "checkpoint") -> DictConfig:
         cfg = policy_config(file)
     else:
         file = run_folder(path, option) / CONFIG
-        cfg = OmegaConf.load(file)
-    if not isinstance(cfg, DictConfig):
-        raise ValueError(f"{option}: {file} holds no settings.")
+        cfg = settings(file.read_text(encoding="utf-8"), file)
     check_origin(OmegaConf.to_container(cfg, resolve=False), file)
     return cfg
 

@@ -16,7 +16,7 @@ from torchrl.envs.transforms import Transform
 
 from saferl.algorithms.assemble import build_trainer, complete
 from saferl.checkpoint.lock import alone
-from saferl.checkpoint.run import CONFIG, FOLDER, run_config, run_folder
+from saferl.checkpoint.run import CONFIG, begun, run_config, run_folder
 from saferl.cli.evaluate import compiling, measure, pictures, trained_policy
 from saferl.cli.launch import job_folder
 from saferl.config.limits import check_limits
@@ -35,7 +35,7 @@ def train(cfg: DictConfig) -> None:
         check_limits(cfg, HydraConfig.get().overrides.task)
         OmegaConf.resolve(cfg)
         if job_folder() and (run / CONFIG).exists():
-            if (run / FOLDER).exists():  # a sweep that is run again
+            if begun(run):  # a sweep that is run again
                 resuming = composed(run_config(run)) == composed(cfg)
             else:  # killed before its first checkpoint, if nobody works on it
                 with alone(run, "out"):
@@ -47,6 +47,9 @@ def train(cfg: DictConfig) -> None:
             claim(run, cfg)
     else:
         run = run_folder(Path(str(cfg.resume)), "resume")
+        for path in run.rglob("*"):
+            if path.is_symlink():  # to write there would be to write elsewhere
+                raise ValueError(f"resume: {path} is a link, which no run has.")
         cfg = prolonged(run_config(run), cfg, HydraConfig.get().overrides.task)
     with alone(run, "resume" if resuming else "out"):
         try:
@@ -63,7 +66,7 @@ def train(cfg: DictConfig) -> None:
                 )
                 trainer.train()
         finally:
-            if not resuming and not (run / FOLDER).exists():  # it never began
+            if not resuming and not begun(run):  # it never began
                 (run / CONFIG).unlink(missing_ok=True)
 
         cfg = compiling(cfg, False)  # the closing test is over before compiling would pay
@@ -160,12 +163,12 @@ def claim(run: Path, cfg: DictConfig) -> None:
     """
     run.mkdir(parents=True, exist_ok=True)
     try:
-        if (run / FOLDER).exists():
+        if begun(run):
             raise FileExistsError
         with (run / CONFIG).open("x") as file:
             OmegaConf.save(cfg, file)
     except FileExistsError:
         way = f"continue it with resume={run}, or take another folder."
-        if not (run / FOLDER).exists():
+        if not begun(run):
             way = "it has just begun, or was killed before its first checkpoint and can be deleted."
         raise ValueError(f"out: {run} holds a run already; {way}") from None

@@ -6,7 +6,6 @@ import importlib.util
 import os
 import re
 import sys
-import sysconfig
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,8 @@ _PARTS = re.compile(
 )
 #: By which a file names a class or a function, its ``path``.
 _NAMING = ("hydra.utils.get_class", "hydra.utils.get_method")
+#: What a node may say to Hydra; positional arguments would not be looked at.
+_HYDRAS = ("_target_", "_convert_", "_partial_", "_recursive_")
 #: What folders are called by.
 _FOLDERS = ("algo_name", "task.task")
 #: Names of packages, parted by commas, whose parts a file may name, too.
@@ -30,7 +31,8 @@ def check_origin(settings: Any, path: Path) -> None:
     """Refuse what a file could run code by, or write outside its folder, before anything is built.
 
     It may name classes of saferl, TorchRL and ``torch.nn``, and classes and functions of one's own modules: those that are neither
-    Python's nor installed, or that the environment variable ``SAFERL_TRUST`` names.
+    Python's nor installed nor lie beside the file, or that the environment variable ``SAFERL_TRUST`` names. It may look
+    nothing up, as a run's file is written without interpolations.
 
     Args:
         settings: of the file, plain mappings and lists.
@@ -41,9 +43,19 @@ def check_origin(settings: Any, path: Path) -> None:
     """
     for name, value in _leaves(settings):
         *_, key = keys = name.split(".")
+        if "${" in f"{name} {value}":  # a run's file is written without
+            raise ValueError(f"{path}: {name} looks something up, {value!r}, which a file may not.")
+        if unknown := [each for each in keys if each[:1] == "_" and each not in _HYDRAS]:
+            raise ValueError(
+                f"{path}: {name} may not be set by a file, as {unknown[0]} is not known."
+            )
         if value is not None and ("_target_" in keys or key == "path"):
             naming = key == "_target_" and value in _NAMING
-            if not naming and not _PARTS.fullmatch(str(value)) and not _own(str(value)):
+            if (
+                not naming
+                and not _PARTS.fullmatch(str(value))
+                and not _own(str(value), path.parent)
+            ):
                 raise ValueError(
                     f"{path}: {name} names {value!r}, which a file may not call. If the file is yours and the package is "
                     f"installed, say so: {TRUST}=package."
@@ -65,8 +77,13 @@ def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         yield from _leaves(below, f"{prefix}.{key}".removeprefix("."))
 
 
-def _own(target: str) -> bool:
-    """Whether a name is of a module of one's own, and was not merely imported into it."""
+def _own(target: str, folder: Path) -> bool:
+    """Whether a name is of a module of one's own, and was not merely imported into it.
+
+    Args:
+        target: the name.
+        folder: of the file that says it, whose own modules are its author's.
+    """
     package = target.partition(".")[0]
     trusted = package in os.environ.get(TRUST, "").split(",")
     if not trusted:
@@ -78,8 +95,10 @@ def _own(target: str) -> bool:
             return False
         if spec is None or spec.origin is None:
             return False
-        installed = {Path(sysconfig.get_path(kind)).resolve() for kind in ("purelib", "platlib")}
-        if installed & set(Path(spec.origin).resolve().parents):
+        place = Path(spec.origin).resolve()
+        if {"site-packages", "dist-packages"} & set(place.parts):
+            return False
+        if folder.resolve() in place.parents:
             return False
     try:
         found = hydra.utils.get_object(target)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 
 from omegaconf import DictConfig, OmegaConf
 
 from saferl.evaluation.compare import flat
+
+log = logging.getLogger(__name__)
 
 #: What each limit is on.
 BOUNDS = {
@@ -43,11 +46,16 @@ def check_limits(cfg: DictConfig, overrides: Sequence[str]) -> None:
                 f"{name} must be given: it bounds {BOUNDS[name]}, which {' and '.join(keys)} of "
                 f"algo={cfg.algo_name} takes."
             )
+    for key, value in flat(OmegaConf.to_container(cfg, resolve=False)).items():
+        name = key.rpartition(".")[2]
+        number = "." in key and name in BOUNDS and isinstance(value, (int, float))
+        if number and value != cfg[name]:
+            raise ValueError(f"{key} follows from {name}: set {name}={value}.")
     given = {override.partition("=")[0].lstrip("+") for override in overrides}
     for name in BOUNDS:
-        if name in given and name not in read and not given & set(read):
+        if name in given and name not in read and (read or name != "cost_limit"):
             has = " and ".join(f"{other}, on {BOUNDS[other]}" for other in read) or "no limit"
-            if read or name != "cost_limit":
-                raise ValueError(
-                    f"{name} is on {BOUNDS[name]}, which algo={cfg.algo_name} does not bound: it has {has}."
-                )
+            about = f"{name} is on {BOUNDS[name]}, which algo={cfg.algo_name} does not bound: it has {has}."
+            if not given & set(read):
+                raise ValueError(about)
+            log.warning(about)  # a sweep gives both

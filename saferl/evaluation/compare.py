@@ -37,10 +37,17 @@ def finished(folders: Sequence[Path]) -> list[tuple[Mapping, Mapping]]:
 
     tests = [test for folder in folders for test in folder.glob(f"**/{TESTED}")]
     return [
-        (OmegaConf.to_container(OmegaConf.load(config)), json.loads(test.read_text()))  # pyright: ignore
+        (OmegaConf.to_container(OmegaConf.load(config)), _figures(test))  # pyright: ignore
         for test in sorted(tests, key=lambda path: (len(str(path)), path))  # 2 before 10
         if (config := test.parents[1] / CONFIG).is_file()
     ]
+
+
+def _figures(test: Path) -> Mapping:
+    try:
+        return json.loads(test.read_text())
+    except ValueError as error:
+        raise ValueError(f"{test} is damaged: {error}; remove it and repeat the test.") from error
 
 
 def flat(node: Any, prefix: str = "") -> dict[str, Any]:
@@ -142,7 +149,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser("python -m saferl.summary", description=__doc__)
     parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="runs lie below it")
     folders = parser.parse_args(arguments).folders
-    runs = finished(folders)
+    try:
+        runs = finished(folders)
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from None
     if not runs:
         raise SystemExit(
             f"error: no run below {', '.join(map(str, folders))} has been tested: give folders of runs, "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ class BestPolicy:
     """Keeps the policy whose last training episodes were the best as ``RUN/best/policy.safetensors``.
 
     Better is whose mean cost is within the limit, if there is one; then what succeeds more often, or, of a task without success,
-    returns more. As training episodes explore, and the best of many means is a lucky one, it is no estimate.
+    returns more. Episodes that began before the first update do not count; the file says whether the limit is kept (``within``). As training episodes explore, and the best of many means is a lucky one, it is no estimate.
 
     Args:
         run: folder of the run.
@@ -36,13 +37,14 @@ class BestPolicy:
     def __init__(self, run: Path, loss: LossModule, cfg: DictConfig):
         self.run, self.loss, self.cfg = run, loss, cfg
         self.score: list[float] = []
+        self.since = -1
 
     def state_dict(self) -> dict[str, Any]:
         """How good the kept one is."""
-        return {"score": list(self.score)}
+        return {"score": list(self.score), "since": self.since}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self.score = list(state["score"])
+        self.score, self.since = list(state["score"]), state["since"]
 
     def look(
         self,
@@ -54,12 +56,19 @@ class BestPolicy:
 
         Args:
             episodes: of the last training episodes ``return``, ``cost_return`` and outcomes, [n] each.
-            counted: frames and episodes so far.
+            counted: frames, episodes and updates so far.
             check: raises where something that is learned is not finite.
         """
-        if not episodes or len(episodes["return"]) < LEAST:
+        if not counted["updates"] or not episodes:
             return
-        means = {name: float(value.double().mean()) for name, value in episodes.items()}
+        if self.since < 0:  # what came before was not learned
+            self.since = counted["episodes"]
+        count = min(counted["episodes"] - self.since, len(episodes["return"]))
+        if count < LEAST:
+            return
+        means = {name: float(value[-count:].double().mean()) for name, value in episodes.items()}
+        if not all(map(math.isfinite, means.values())):
+            return
         limit = self.cfg.cost_limit
         within = limit is None or means["cost_return"] <= limit
         score = [float(within), means.get("success", means["return"])]
@@ -67,5 +76,5 @@ class BestPolicy:
             return
         check()
         self.score = score
-        about = {"return": means["return"], "cost_return": means["cost_return"]}
+        about = {"return": means["return"], "cost_return": means["cost_return"], "within": within}
         write_policy(self.run / BEST, self.loss.state_dict(), self.cfg, {**counted, **about})

@@ -34,8 +34,14 @@ class CostWatch:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
 
+    def take(self, costs: Tensor) -> None:
+        """Take the costs [n] of the episodes that have just ended."""
+        if self.limit is not None:
+            self.dearest = max(self.dearest, float(costs.max()))
+            self.bound = self.bound or self.dearest >= self.limit
+
     def look(self, costs: Tensor | None, frames: int, spent: float) -> None:
-        """Take the costs [n] of the last episodes of training.
+        """Say what is to be said of the costs [n] of the last episodes of training.
 
         Args:
             costs: None before the first.
@@ -44,8 +50,7 @@ class CostWatch:
         """
         if self.limit is None or costs is None or not len(costs):
             return
-        mean, self.dearest = float(costs.mean()), max(self.dearest, float(costs.max()))
-        self.bound = self.bound or self.dearest > self.limit
+        mean = float(costs.mean())
         if not self.bound and not self.idle and spent >= EARLY:
             self.idle = True
             log.warning(

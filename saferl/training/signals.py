@@ -26,7 +26,7 @@ class CriticSignal:
         self.risk_limit = risk_limit
 
     def register(self, trainer: Trainer) -> None:
-        self._lagrange = _multiplier(trainer)
+        self._lagrange, self._trainer = _multiplier(trainer), trainer
         if "constraint_violation" not in trainer.learner.loss.out_keys:
             raise ValueError(
                 f"lagrange.signal=CriticSignal needs Q_c(s, a), which {type(trainer.learner.loss).__name__} "
@@ -46,7 +46,7 @@ class CriticSignal:
 
     def _watch(self, finished: TensorDictBase, spent: float) -> None:
         """Say once that the limit limits nothing."""
-        if spent >= EARLY and not self._told:
+        if spent >= EARLY and self._trainer.progress.updates and not self._told:
             self._told = True
             if float(self._lagrange.value) <= self._begin:
                 log.warning(

@@ -299,6 +299,8 @@ class Trainer:
         for hook in self.after_collect:
             hook(finished, self.spent)
         if len(finished):
+            self.watch.take(finished["cost_return"])
+            self.watch.look(self._costs, progress.frames, self.spent)
             progress.last_end = self.budget.done(progress)
         with self.clock.phase("learn"):
             for batch in self.experience.batches(data, progress.frames):
@@ -317,11 +319,10 @@ class Trainer:
         collected last, and at whether the policy is the best so far."""
         progress = self.progress
         progress.last_record = progress.frames
-        self.watch.look(self._costs, progress.frames, self.spent)
         if self.watchdog is not None:
             self.watchdog.look(data, progress.frames)
         if self.best is not None:
-            counted = {"frames": progress.frames, "episodes": progress.episodes}
+            counted = {name: getattr(progress, name) for name in ("frames", "episodes", "updates")}
             self.best.look(self.window.values, counted, self._check_finite)
         row = {
             "frames": progress.frames,

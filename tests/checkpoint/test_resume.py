@@ -123,9 +123,10 @@ def test_every_later_step_is_the_same(algo: str, vehicles: int, scenario: str, t
     trainer.save()
     batches = iter(trainer.collector)
     while trainer.spent < 0.45:
-        trainer._take(next(batches))
+        data = next(batches)
+        trainer._take(data)
         if trainer.progress.frames - trainer.progress.last_record >= trainer.record_every:
-            trainer._record()
+            trainer._record(data)
     trainer.save()
     assert trainer._count and trainer.progress.episodes
 
@@ -214,8 +215,8 @@ def test_tensorboard_shows_a_resumed_run_once(save_every: int, tmp_path: Path):
     killed = build_trainer(compose(*options), tmp_path / "killed")
     record = killed._record
 
-    def die():
-        record()
+    def die(data):
+        record(data)
         if killed.progress.frames >= 16:
             raise InterruptedError
 

@@ -274,7 +274,7 @@ def test_a_mistake_in_a_process_of_its_own(spawn, tmp_path: Path):
 
 def test_a_buffer_that_cannot_fit_is_refused(refusal, monkeypatch):
     """With what a transition takes: 9 + 66 numbers of either state and what else is kept of it."""
-    monkeypatch.setattr("saferl.training.experience.memory", lambda device: 2**20)
+    monkeypatch.setattr("saferl.training.experience.memory", lambda: 2**20)
     options = (*TRAIN, *SMALL, *EMPTY, "algo=sac", "task.observation=world", "task.rows=11")
     line = refusal(*options, "learning.buffer_size=3000")
     found = re.search(

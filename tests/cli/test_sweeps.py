@@ -114,7 +114,7 @@ def test_a_job_stays_in_the_folder_of_its_sweep(command, tmp_path: Path, capsys)
     assert all(path.parts[0] == "tests" for path in made)
     assert Path("tests/checkpoint-here_run/metrics.json") in made
     command("export", "export", "-m", "checkpoint=here/run,./here/run", "out=policies")
-    assert len(list(tmp_path.glob("policies/*/policy.torchrl"))) == 2
+    assert len(list(tmp_path.glob("policies/*/policy.safetensors"))) == 2
     command("export", "export", "checkpoint=here/run", "out=alone")  # the sweep before is forgotten
     assert [path.read_text() for path in tmp_path.rglob("error.txt")].count("mine") == 2
 

@@ -22,7 +22,7 @@ import torch
 from small import SMALL, fitting
 
 from saferl.checkpoint import sealed
-from saferl.checkpoint.run import FOLDER, latest
+from saferl.checkpoint.run import FOLDER, begun, latest
 from saferl.cli.launch import launch
 
 pytestmark = pytest.mark.slow
@@ -93,7 +93,7 @@ def said(folder: Path) -> str:
 def finish(folder: Path, arguments: Sequence[str]) -> None:
     """Continue the run in ``folder/run`` to its end, or begin it where nothing is there to continue."""
     run = folder / "run"
-    if (run / FOLDER).is_dir():
+    if begun(run):
         arguments = ["resume=run"]
     else:
         shutil.rmtree(run, ignore_errors=True)
@@ -147,7 +147,7 @@ def test_kills_at_random_moments(whole, tmp_path: Path):
         time.sleep(draw.uniform(0.1, seconds))
         os.kill(child, signal.SIGKILL)
         ended(child)
-        if (folder / "run" / FOLDER).is_dir() and draw.random() < 0.5:  # and once more
+        if begun(folder / "run") and draw.random() < 0.5:  # and once more
             child = begin(folder, ["resume=run"])
             time.sleep(draw.uniform(0.1, seconds))
             os.kill(child, signal.SIGKILL)

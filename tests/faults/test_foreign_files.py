@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -40,6 +41,11 @@ EVIL = [
     ("lagrange.signal._target_", "own_module.os.system"),
     ("learning._target_", ["os.system"]),
     ("learning._target_", {"path": "os.system"}),
+    ("encoder.activation", "${oc.create:{_target_: torch.hub.load}}"),
+    ("task.noise", "${oc.env:HOME}"),
+    ("risk", {"_target_": "hydra.utils.get_method", "_args_": ["os.abort"]}),
+    ("encoder.activation", {"_target_": "hydra.utils.get_class", "_args_": ["antigravity.X"]}),
+    ("logger.sinks", [{"_target_": "torchrl.record.loggers.CSVLogger", "exp_name": "${init}"}]),
     ("task.id", "antigravity:X-v0"),
     ("algo_name", "../../x"),
     ("task.task", "/tmp/x"),
@@ -62,6 +68,37 @@ def test_a_configuration_names_parts_alone(
     OmegaConf.save(cfg, tmp_path / "policy" / CONFIG)
     with pytest.raises(ValueError, match=r"may not|must be without"):
         run_config(tmp_path / "policy", option)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [("a: [1", "cannot be read"), ("3", "holds no settings"), ("task: 3", "must be a mapping")],
+)
+def test_a_configuration_that_is_none_is_refused(text: str, reason: str, tmp_path: Path):
+    (tmp_path / CONFIG).write_text(text)
+    with pytest.raises(ValueError, match=reason):
+        run_config(tmp_path)
+
+
+def test_modules_beside_a_file_are_its_authors(
+    theirs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "their_parts.py").write_text("raise SystemExit('it ran')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    cfg = OmegaConf.load(theirs / CONFIG)
+    cfg.risk._target_ = "their_parts.Part"
+    OmegaConf.save(cfg, tmp_path / CONFIG)
+    with pytest.raises(ValueError, match="may not call"):
+        run_config(tmp_path)
+
+
+def test_a_run_whose_files_are_links_does_not_go_on(theirs: Path, tmp_path: Path, refusal):
+    shutil.copytree(theirs, tmp_path / "run")
+    (tmp_path / "mine").write_text("precious")
+    (tmp_path / "run/metrics.csv").unlink()
+    (tmp_path / "run/metrics.csv").symlink_to(tmp_path / "mine")
+    assert "is a link" in refusal("train", "config", "resume=run", "frames=48")
+    assert (tmp_path / "mine").read_text() == "precious"
 
 
 def test_ones_own_parts_may_be_named(theirs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

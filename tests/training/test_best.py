@@ -23,7 +23,10 @@ def window(success: float, cost: float, count: int = 60) -> dict[str, torch.Tens
 def test_the_best_is_within_the_limit_and_succeeds_most(tmp_path: Path):
     trainer = trainer_of(tmp_path, "algo=rsac", "cost_limit=0.1")
     best, file = trainer.best, tmp_path / BEST / EXPORTED
-    assert best is not None
+    for updates, episodes in ((0, 20), (1, 40), (2, 99)):  # begun before the first update
+        counted = {"frames": 1, "episodes": episodes, "updates": updates}
+        best.look(window(1.0, 0.0), counted, lambda: None)
+    assert not file.exists()
     kept, actor = [], next(trainer.learner.loss.actor_network_params.values(True, True))
     course = [
         (0.9, 0.5, True),  # anything is better than nothing
@@ -34,12 +37,15 @@ def test_the_best_is_within_the_limit_and_succeeds_most(tmp_path: Path):
     ]
     for number, (success, cost, better) in enumerate(course):
         actor.data.fill_(number)
-        counted = {"frames": number, "episodes": 0}
+        counted = {"frames": number, "episodes": 100, "updates": 1}
         best.look(window(success, cost), counted, lambda: None)
         kept = number if better else kept
         assert policy_counted(file)["frames"] == kept
-    best.look(window(1.0, 0.0, count=49), {"frames": 9, "episodes": 0}, lambda: None)  # too few
-    assert progress(tmp_path / BEST) == {"frames": 4, "episodes": 0}
+    best.look(
+        window(1.0, 0.0, count=49), {"frames": 9, "episodes": 100, "updates": 1}, lambda: None
+    )  # too few
+    assert progress(tmp_path / BEST) == {"frames": 4, "episodes": 100}
+    assert policy_counted(file)["within"] is True
     agent = load_agent(run_config(tmp_path / BEST), tmp_path / BEST, "checkpoint")
     assert (next(agent.loss.actor_network_params.values(True, True)) == 4).all()
 
@@ -48,8 +54,11 @@ def test_what_is_not_finite_does_not_become_the_best(tmp_path: Path):
     trainer = trainer_of(tmp_path, "algo=sac")
     next(trainer.learner.loss.actor_network_params.values(True, True)).data.fill_(torch.nan)
     trainer.progress.frames = 8
+    trainer.best.since = 0
     with pytest.raises(ValueError, match="not finite"):
-        trainer.best.look(window(1, 0), {"frames": 8, "episodes": 1}, trainer._check_finite)
+        trainer.best.look(
+            window(1, 0), {"frames": 8, "episodes": 100, "updates": 1}, trainer._check_finite
+        )
     assert not (tmp_path / BEST).exists()
 
 
@@ -59,7 +68,7 @@ def test_a_training_keeps_its_best_and_a_resume_goes_on_from_it(tmp_path: Path):
     trainer = build_trainer(cfg, tmp_path)
     trainer.train()
     counted = policy_counted(tmp_path / BEST / EXPORTED)
-    assert 0 < counted["frames"] <= 400 and counted["episodes"] >= 50
+    assert 0 < counted["frames"] <= 400 and counted["episodes"] >= 50 < counted["updates"]
     again = build_trainer(cfg, tmp_path)
     again.resume()
     assert again.best.score == trainer.best.score != []

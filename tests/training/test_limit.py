@@ -25,12 +25,14 @@ def costs(*values: float, count: int = 200) -> torch.Tensor:
 
 def test_what_is_said_on_the_way(caplog):
     watch = CostWatch(5.0)
+    watch.take(torch.tensor([1.0, 4.0]))
     assert not told(caplog, lambda: watch.look(None, 1, 0.5))
     assert not told(caplog, lambda: watch.look(costs(1.0, 2.0), 100, 0.05))  # early
     (idle,) = told(caplog, lambda: watch.look(costs(1.0, 4.0), 200, 0.1))
     assert idle == "cost_limit=5 has limited nothing so far: no episode cost more than 4."
     assert not told(caplog, lambda: watch.look(costs(1.0, 4.0), 300, 0.2))  # once
-    assert not told(caplog, lambda: watch.look(costs(1.0, 12.0), 400, 0.3))  # it binds
+    watch.take(torch.tensor([1.0, 12.0]))  # it binds
+    assert not told(caplog, lambda: watch.look(costs(1.0, 12.0), 400, 0.3))
     assert not told(caplog, lambda: watch.look(costs(1.0, 6.0, count=100), 500, 0.4))  # too few
     (met,) = told(caplog, lambda: watch.look(costs(1.0, 6.0), 600, 0.5))
     assert met == "cost_limit=5 is met at frame 600: the last 200 episodes cost 3.5 in the mean."
@@ -55,7 +57,7 @@ def test_what_is_said_on_the_way(caplog):
 )
 def test_what_is_said_at_the_end(values, dearest, level, begins, caplog):
     watch = CostWatch(5.0)
-    watch.look(torch.tensor([dearest]), 1, 0.0)
+    watch.take(torch.tensor([dearest]))
     (message,) = told(caplog, lambda: watch.judge(costs(*values)))
     assert message.startswith(begins) and caplog.records[0].levelname == level
     assert not told(caplog, lambda: CostWatch(None).judge(costs(*values)))
