@@ -17,6 +17,9 @@ BOUNDS = {
     "risk_limit": "the discounted cost ahead in each state",
 }
 
+#: In place of one that a task leaves to its user.
+USUAL = {"cost_limit": 0.1, "risk_limit": 0.05}
+
 
 def readers(cfg: DictConfig) -> dict[str, list[str]]:
     """The settings that each limit goes into, of a configuration that is not resolved."""
@@ -28,7 +31,7 @@ def readers(cfg: DictConfig) -> dict[str, list[str]]:
 
 
 def check_limits(cfg: DictConfig, overrides: Sequence[str]) -> None:
-    """Refuse a limit that an algorithm lacks, or that is given in place of the one that it has.
+    """Refuse a limit that is given in place of the one that an algorithm has; write the usual one where none is given.
 
     A ``cost_limit`` that an algorithm without any constraint is given stands beside its figures.
 
@@ -42,9 +45,14 @@ def check_limits(cfg: DictConfig, overrides: Sequence[str]) -> None:
     read = {name: keys for name, keys in readers(cfg).items() if keys}
     for name, keys in read.items():
         if cfg[name] is None:
-            raise ValueError(
-                f"{name} must be given: it bounds {BOUNDS[name]}, which {' and '.join(keys)} of "
-                f"algo={cfg.algo_name} takes."
+            cfg[name] = USUAL[name]
+            log.warning(
+                "%s=%g, as none is given: it bounds %s, which %s of algo=%s takes.",
+                name,
+                cfg[name],
+                BOUNDS[name],
+                " and ".join(keys),
+                cfg.algo_name,
             )
     for key, value in flat(OmegaConf.to_container(cfg, resolve=False)).items():
         name = key.rpartition(".")[2]
