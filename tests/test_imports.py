@@ -53,9 +53,9 @@ ROOMS = {
     "modules": set(),
     "envs": {"modules"},  # its transforms alone, see below
     "objectives": {"modules"},
-    "checkpoint": set(),
-    "evaluation": {"checkpoint", "envs", "modules"},
-    "training": {"checkpoint", "evaluation", "envs", "objectives", "modules"},
+    "checkpoint": {"config"},
+    "evaluation": {"config", "checkpoint", "envs", "modules"},
+    "training": {"config", "checkpoint", "evaluation", "envs", "objectives", "modules"},
     "config": {"envs"},
     "algorithms": {"config", "training", "checkpoint", "envs", "objectives", "modules"},
     "cli": {"config", "algorithms", "training", "evaluation", "checkpoint", "envs"},

@@ -20,6 +20,7 @@ from saferl.checkpoint.run import begun, latest, load_component, run_config
 from saferl.checkpoint.state import Fitting, Networks
 from saferl.config.check import arguments, check, check_targets, check_task
 from saferl.envs.task import Task
+from saferl.objectives.values import critic_values
 from saferl.training.best import BestPolicy
 from saferl.training.experience import check_memory
 from saferl.training.limit import CostWatch
@@ -198,7 +199,7 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         learner=learner,
         window=EpisodeWindow(parts.task.outcomes),
         watch=CostWatch(cfg.cost_limit),
-        watchdog=Watchdog(agent.loss, cfg.gamma, cfg.learning.reward_scale),
+        watchdog=Watchdog(agent.loss, cfg.gamma, cfg.learning.reward_scale, critic_values),
         best=BestPolicy(run, agent.loss, cfg),
         budget=Budget(cfg.episodes, cfg.frames),
         record_every=cfg.record_every,

@@ -13,8 +13,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from saferl.config import catalog, schema
+from saferl.config.flat import flat
 from saferl.config.locate import config_dir
-from saferl.evaluation.compare import flat
 
 #: What a user can get wrong; any other exception is a fault of ours and keeps its trace.
 MISTAKES = (ValueError, OSError, HydraException, OmegaConfBaseException)

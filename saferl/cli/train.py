@@ -47,11 +47,11 @@ def train(cfg: DictConfig) -> None:
             claim(run, cfg)
     else:
         run = run_folder(Path(str(cfg.resume)), "resume")
-        for path in run.rglob("*"):
-            if path.is_symlink():  # to write there would be to write elsewhere
-                raise ValueError(f"resume: {path} is a link, which no run has.")
         cfg = prolonged(run_config(run), cfg, HydraConfig.get().overrides.task)
     with alone(run, "resume" if resuming else "out"):
+        for path in run.rglob("*"):
+            if path.is_symlink():  # to write there would be to write elsewhere
+                raise ValueError(f"{path} is a link, which no run has.")
         try:
             with closing(build_trainer(cfg, run)) as trainer:
                 if resuming:

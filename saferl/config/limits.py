@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from omegaconf import DictConfig, OmegaConf
 
-from saferl.evaluation.compare import flat
+from saferl.config.flat import flat
 
 log = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
-from saferl.evaluation.compare import flat
+from saferl.config.flat import flat
 
 #: Bytes that an environment takes at least, and copies of a layer in training: its weights, their gradients, both
 #: moments of Adam, the targets.

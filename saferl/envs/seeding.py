@@ -6,7 +6,7 @@ No generator is shared: what happens in an episode follows from its own 31-bit s
 from __future__ import annotations
 
 import secrets
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,10 +14,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
-
-if TYPE_CHECKING:  # a task asks for seeds
-    from saferl.envs.task import Task
-
 
 _MIX = (-7046029254386353131, -4658895280553007687, -7723592293110705685)
 U31 = 0x7FFFFFFF
@@ -71,11 +67,11 @@ class SeededEnv(EnvBase):
 
     kept: tuple[str, ...] = ("_stream", "_episode")
 
-    def __init__(self, task: Task, num_envs: int, device=None):
+    def __init__(self, task: Any, num_envs: int, device=None):
         if num_envs < 1:
             raise ValueError(f"num_envs must be >= 1, got {num_envs}.")
         super().__init__(device=device, batch_size=[num_envs])  # pyright: ignore[reportArgumentType]
-        self.task: Any = task
+        self.task = task  # a saferl.envs.task.Task, which asks this module for seeds
         self.real = torch.get_default_dtype()
 
     def _reals(self, values: dict[str, Any]) -> dict[str, Any]:

@@ -13,6 +13,8 @@ from typing import Any
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
+from saferl.config.flat import flat
+
 #: Not the composition: what tells its repetitions apart.
 REPETITION = ("seed", "out")
 COLUMNS = ("success_rate", "collision_rate", "return", "cost_return")
@@ -48,21 +50,6 @@ def _figures(test: Path) -> Mapping:
         return json.loads(test.read_text())
     except ValueError as error:
         raise ValueError(f"{test} is damaged: {error}; remove it and repeat the test.") from error
-
-
-def flat(node: Any, prefix: str = "") -> dict[str, Any]:
-    """A nested configuration by dotted keys.
-
-    >>> flat({"lr": {"actor": [1, 2]}, "seed": 0})
-    {'lr.actor': [1, 2], 'seed': 0}
-    """
-    if not isinstance(node, Mapping):
-        return {prefix: node}
-    return {
-        name: value
-        for key, below in node.items()
-        for name, value in flat(below, f"{prefix}.{key}".removeprefix(".")).items()
-    }
 
 
 def names(configs: Sequence[Mapping]) -> list[str]:

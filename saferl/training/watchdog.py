@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
-
-from saferl.modules.ensemble import BoundCritics
 
 log = logging.getLogger(__name__)
 
@@ -38,10 +37,19 @@ class Watchdog:
         loss: has some of the networks ``qvalue_network``, ``critic_network``, ``cost_critic``, ``risk_critic``.
         gamma: their discount; with 1 there is no range.
         reward_scale: of the rewards that the loss sees.
+        values: what a network of the loss, by its name, says of transitions [B]
+            (:func:`saferl.objectives.values.critic_values`).
     """
 
-    def __init__(self, loss: LossModule, gamma: float, reward_scale: float = 1.0):
+    def __init__(
+        self,
+        loss: LossModule,
+        gamma: float,
+        reward_scale: float,
+        values: Callable[[LossModule, str, TensorDictBase], Tensor],
+    ):
         self.loss, self.gamma, self.reward_scale = loss, gamma, reward_scale
+        self.values = values
         self.seen: dict[str, Tensor] = {}
         self.left: dict[str, int] = {}
 
@@ -75,7 +83,7 @@ class Watchdog:
             scale = self.reward_scale if kind == "reward" else 1.0
             low, high = (float(end) * scale / (1.0 - self.gamma) for end in self.seen[kind])
             slack = (TOLERANCE - 1.0) * max(high - low, 1.0) + self._entropy(name)
-            values = self._values(name, data)
+            values = self.values(self.loss, name, data)
             least, most = float(values.amin()), float(values.amax())
             if not (low - slack <= least and most <= high + slack):
                 self.left[name] = frames
@@ -96,16 +104,6 @@ class Watchdog:
             return ""
         name, frame = min(self.left.items(), key=lambda item: item[1])
         return f" {name} had left its range at frame {frame}."
-
-    def _values(self, name: str, data: TensorDictBase) -> Tensor:
-        network, params = getattr(self.loss, name), getattr(self.loss, f"{name}_params")
-        if len(params.batch_size):  # members side by side
-            action: Any = getattr(self.loss.tensor_keys, "action")  # noqa: B009
-            members = BoundCritics.of(network, params, data, action_key=action)
-            return members.values(data.get(action))
-        with params.to_module(network, preserve_module_state=False):
-            out = network(data.select(*network.in_keys))
-        return out.get(network.out_keys[-1])
 
     def _entropy(self, name: str) -> float:
         """What the bonus for entropy may add to a reward's value, ten nats for each dimension."""

@@ -18,7 +18,7 @@ from small import SMALL, compose, fitting
 from saferl.checkpoint.run import latest
 from saferl.cli.launch import launch
 from saferl.config.catalog import GROUPS, options
-from saferl.evaluation.compare import flat
+from saferl.config.flat import flat
 
 #: Of a training of three updates, which what is drawn may replace.
 FEW = (*SMALL, "task.vehicles=1", "task.duration=2")

@@ -206,7 +206,7 @@ class BatchedIntersection(IntersectionBase):
 
     >>> env = BatchedIntersection(Scenario(task="lt"), num_envs=3)
     >>> env.rollout(4)["next", "vehicles"].shape
-    torch.Size([3, 4, 11, 14])
+    torch.Size([3, 4, 11, 12])
     """
 
     def __init__(

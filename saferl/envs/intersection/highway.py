@@ -59,7 +59,7 @@ class IntersectionEnv(gymnasium.Env):
     >>> env = IntersectionEnv(task="lt")
     >>> observation, info = env.reset(seed=0)
     >>> observation["vehicles"].shape, info["success"]
-    ((11, 14), False)
+    ((11, 12), False)
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012
