@@ -47,8 +47,15 @@ class RunCheckpoint:
         self.rotation = CheckpointRotation(run / FOLDER, keep_last=keep)
 
     def save(self, frames: int, metadata: dict[str, Any]) -> Path:
-        """Write atomically; an interrupted write leaves the previous checkpoint whole."""
-        return self.rotation.save(self.checkpoint, step=frames, metadata=metadata)
+        """Write atomically; an interrupted write leaves the previous checkpoint whole.
+
+        Raises:
+            OSError: it cannot be written, for lack of room perhaps.
+        """
+        try:
+            return self.rotation.save(self.checkpoint, step=frames, metadata=metadata)
+        except RuntimeError as error:  # as torch calls it where a file cannot grow
+            raise OSError(f"the checkpoint of frame {frames} cannot be written: {error}") from error
 
     def load_latest(self) -> Path:
         """Restore every component from the newest checkpoint, and clear away unfinished ones.
