@@ -57,7 +57,7 @@ def write_policy(
     mine = OmegaConf.merge(cfg, {"out": None, "init": None, "resume": None})
     config, numbers = OmegaConf.to_yaml(mine, resolve=True), json.dumps(dict(counted))
     about = {_CONFIG: config, _COUNTED: numbers}
-    about |= {_CHECKSUM: _checksum(tensors, config, numbers), "format": "saferl 1"}
+    about[_CHECKSUM] = _checksum(tensors, config, numbers)
     folder.mkdir(parents=True, exist_ok=True)
     part, file = folder / f".{EXPORTED}.part", folder / EXPORTED
     save_file(tensors, part, metadata=about)

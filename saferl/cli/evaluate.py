@@ -100,8 +100,7 @@ def trained_policy(cfg: DictConfig, path: Path) -> tuple[TensorDictModuleBase, l
     if agent.projector is None:
         return agent.actor, []
     if hasattr(agent.projector, "set_progress"):
-        counted = progress(path)
-        spent = Budget(cfg.episodes, cfg.frames).spent(**counted) if counted else 1.0
+        spent = Budget(cfg.episodes, cfg.frames).spent(**progress(path))
         agent.projector.set_progress(spent)
     return agent.actor, [agent.projector]
 

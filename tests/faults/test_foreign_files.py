@@ -48,7 +48,7 @@ EVIL = [
     ("logger.sinks", [{"_target_": "torchrl.record.loggers.CSVLogger", "exp_name": "${init}"}]),
     ("task.id", "antigravity:X-v0"),
     ("algo_name", "../../x"),
-    ("task.task", "/tmp/x"),
+    ("task.task", "../x"),
     ("logger.sinks", [{"_target_": "os.system", "command": "x"}]),
     ("logger.sinks", [{"_target_": "torchrl.record.loggers.CSVLogger", "exp_name": "../../x"}]),
 ]
