@@ -94,7 +94,7 @@ REFUSED = {
     "env=cart": "plays a Cart, but task=gs is a Scenario",
     "env=gym": "plays a GymTask, but task=gs is a Scenario",
     "experiment=cart": "reads ego, vehicles, but task=cart observes observation",
-    "experiment=speed": "but task=\S+ observes observation|cannot be made: .*(No module|not installed)",
+    "experiment=speed": r"but task=\S+ observes observation|cannot be made: .*(No module|not installed)",
     "learning=on_policy": "OnPolicy learns by losses with a critic_network, which .*SACLagLoss has not",
     "lagrange=none": "needs lagrange, got lagrange=none",
     **{
@@ -105,7 +105,7 @@ REFUSED = {
     "loss=sac": "takes no cost_critic",
     "risk=cvar": "risk=cvar is of quantiles: set cost_critic=quantile",
     "task=cart": "reads ego, vehicles, but task=cart observes observation",
-    "task=gym": "reads ego, vehicles, but task=\S+ observes observation",
+    "task=gym": r"reads ego, vehicles, but task=\S+ observes observation",
 }
 
 

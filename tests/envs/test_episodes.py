@@ -16,7 +16,14 @@ from batch import (
     step,
 )
 
-from saferl.envs.intersection.geometry import ROUTES, ROUTES_OF_TASK, project, reference_lines
+from saferl.envs.intersection.base import Scenario
+from saferl.envs.intersection.geometry import (
+    ROUTES,
+    ROUTES_OF_TASK,
+    TASK_OF_ROUTE,
+    project,
+    reference_lines,
+)
 from saferl.envs.intersection.spawning import (
     draw_route,
     draw_start,
@@ -45,6 +52,17 @@ def test_starts_are_forty_metres_before_the_box_in_the_lane_of_the_route(task):
     if task == "mixed":
         share = torch.bincount(route, minlength=4) / 2000
         assert (share - torch.tensor([2, 1, 1, 2]) / 6).abs().max() < 0.04
+
+
+def test_a_test_of_mixed_has_each_task_equally_often():
+    scenario = Scenario(task="mixed")
+    seeds = scenario.episodes(3, 1000)
+    task = torch.tensor(TASK_OF_ROUTE)[draw_route("mixed", seeds)]
+    assert torch.equal(task, torch.arange(1000) % 3)
+    assert len(seeds.unique()) == 1000 and torch.equal(scenario.episodes(3, 10), seeds[:10])
+    assert not torch.isin(seeds, scenario.episodes(4, 1000)).any()
+    inner = (draw_route("mixed", seeds[1::3]) == 1).float().mean()
+    assert 0.42 < inner < 0.58  # the lanes are still drawn
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])

@@ -21,10 +21,10 @@ from torchrl.envs import EnvBase
 
 from saferl.envs.intersection.collision_cost import CollisionCost
 from saferl.envs.intersection.drivers import DRIVERS
-from saferl.envs.intersection.geometry import ROUTES, ROUTES_OF_TASK
+from saferl.envs.intersection.geometry import ROUTES, ROUTES_OF_TASK, TASK_OF_ROUTE
 from saferl.envs.intersection.observation import FORMS, ROWS, Form, reading
 from saferl.envs.intersection.reward import Reward
-from saferl.envs.intersection.spawning import SCENARIOS, Traffic
+from saferl.envs.intersection.spawning import SCENARIOS, Traffic, draw_route
 from saferl.envs.intersection.yielding import PERIOD
 from saferl.envs.seeding import SeededEnv
 from saferl.envs.task import Task
@@ -134,6 +134,17 @@ class Scenario(Task):
         object.__setattr__(self, "traffic", traffic)
         if self.standstill is not None and self.standstill <= 0:
             raise ValueError(f"standstill must be null or > 0 seconds, got {self.standstill}.")
+
+    def episodes(self, seed: int, count: int) -> Tensor:
+        """The seeds [count] of a test's episodes; of ``mixed``, left, straight and right take turns."""
+        if self.task != "mixed":
+            return super().episodes(seed, count)
+        drawn = super().episodes(
+            seed, 8 * count + 100
+        )  # in which a third of count is there of each
+        task = torch.tensor(TASK_OF_ROUTE)[draw_route(self.task, drawn)]
+        turns = [drawn[task == each][: -(-count // 3)] for each in range(3)]
+        return torch.stack(turns, -1).flatten()[:count]
 
     drivers: ClassVar[Mapping[str, Callable[[int], TensorDictModuleBase]]] = DRIVERS
     demonstrators: ClassVar[Sequence[str]] = ("scripted", "blind")
