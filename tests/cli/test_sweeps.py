@@ -7,9 +7,11 @@ import shutil
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 from small import EMPTY, SMALL
 
 from saferl.checkpoint.run import CONFIG
+from saferl.config.locate import config_dir
 from saferl.evaluation.compare import main as summarise
 
 TRAIN, TEST, EXPORT = ("train", "config"), ("evaluate", "evaluate"), ("export", "export")
@@ -143,3 +145,27 @@ def test_the_trace_of_a_job_is_kept_where_it_is_asked_for(command, tmp_path: Pat
             *TRAIN, *SMALL, "-m", "task=cart", "algo=sac", "learning.batch_size=100000", "out=many"
         )
     assert "Traceback" in (tmp_path / "many/0/error.txt").read_text()
+
+
+def test_the_experiments_of_the_paper_share_what_both_need(command, tmp_path: Path, capsys):
+    """One folder a system and seed, on all three tasks; what is there is left alone, whichever experiment made it."""
+    small = (*SMALL, *EMPTY, "frames=8", "evaluation.episodes=3", "seed=0")
+    command(*TRAIN, *small, "experiment=paper_comparison", "algo=sac,rsac")
+    command(*TRAIN, *small, "experiment=paper_ablation", "algo=sac,arsac_unprojected")
+    assert "paper/sac/seed0 is there already" in capsys.readouterr().out
+    runs = {path.parent.relative_to(tmp_path).as_posix() for path in tmp_path.rglob(CONFIG)}
+    assert runs == {f"paper/{algo}/seed0" for algo in ("sac", "rsac", "arsac_unprojected")}
+    for run in runs:
+        lines = (tmp_path / run / "evaluation/episodes.csv").read_text().splitlines()
+        assert [line.split(",")[2][:2] for line in lines[1:]] == ["lt", "gs", "rt"]
+
+
+@pytest.mark.parametrize("name", ["paper_comparison", "paper_ablation"])
+def test_an_experiment_of_the_paper_sweeps_its_systems_and_seeds(name: str):
+    swept = OmegaConf.load(Path(config_dir()) / f"experiment/{name}.yaml").hydra.sweeper.params
+    systems = {
+        "paper_comparison": "arsac asac rsac sac sac_lag sac_rs ppo_rs cpo",
+        "paper_ablation": "arsac arsac_unprojected asac rsac sac",
+    }[name]
+    assert swept.algo.split(",") == systems.split()
+    assert swept.get("seed", "0,1,2,3,4") == "0,1,2,3,4"
