@@ -13,7 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from saferl.modules.mmam import MMAM, MMAMPolicyEncoder, MMAMValue, _EgoAttention
+from saferl.modules.attention import EgoAttention
+from saferl.modules.mmam import MMAM, MMAMPolicyEncoder, MMAMValue
 from saferl.modules.scene import MASKED, largest
 
 
@@ -29,7 +30,7 @@ def _attend(
     return (logits.softmax(-1) @ value).transpose(-3, -2).flatten(-2)
 
 
-def _ego_attend(hop: _EgoAttention, row: Tensor, tokens: Tensor, present: Tensor) -> Tensor:
+def _ego_attend(hop: EgoAttention, row: Tensor, tokens: Tensor, present: Tensor) -> Tensor:
     """Attention of the EV's row [*B, d] to all tokens [*B, N, d]."""
     query = hop.query(row).unsqueeze(-2)
     keys, values = hop.key(tokens), hop.value(tokens)
@@ -53,7 +54,7 @@ class PlainMMAMPolicyEncoder(MMAMPolicyEncoder):
     def forward(self, ego: Tensor, vehicles: Tensor) -> Tensor:
         embedded, present = self.tokens(ego, vehicles)
         hop = self.self_attention
-        if isinstance(hop, _EgoAttention):
+        if isinstance(hop, EgoAttention):
             query, key, value = hop.query(embedded), hop.key(embedded), hop.value(embedded)
         else:
             query, key, value = hop.query_key_value(embedded).chunk(3, dim=-1)

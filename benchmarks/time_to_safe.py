@@ -37,6 +37,7 @@ import hydra
 import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 from side_by_side import belongs, write
 
 from saferl.algorithms.assemble import build_env, build_trainer
@@ -88,6 +89,7 @@ def train(out: Path, overrides: list[str], minutes: float, every: float, episode
         cfg = compose("config", [*overrides, "threads=1", "logger=none", "save_minutes=null"])
     shutil.rmtree(out, ignore_errors=True)  # of a run that was stopped
     begin, testing, due = time.monotonic(), 0.0, every
+    OmegaConf.resolve(cfg)  # so that its policy can be tested
     trainer = build_trainer(cfg, out)
     projector = test_projector(cfg, trainer.learner.loss)
     claim(out, cfg)

@@ -17,7 +17,7 @@ from saferl.algorithms.networks import NetworkBuilder, critic_options, refuse_op
 from saferl.algorithms.parts import Parts, make
 from saferl.envs.task import Task
 from saferl.envs.transforms import SafetyProjector
-from saferl.modules import CVaR, MeanStd
+from saferl.modules import CriticEnsemble, CVaR, MeanStd
 from saferl.training.learner import Learner
 from saferl.training.trainer import Experience
 
@@ -44,6 +44,16 @@ class Agent:
     observed: tuple[str, ...]
     loss: LossModule
     projector: SafetyProjector | None
+
+    @property
+    def transforms(self) -> list[Transform]:
+        """What the policy drives with."""
+        return [] if self.projector is None else [self.projector]
+
+    @property
+    def risk(self) -> CriticEnsemble | None:
+        """Q_c(s, a) of the live cost critics; None where the loss has none."""
+        return getattr(self.loss, "cost_value", None)
 
     @property
     def stored(self) -> tuple[Any, ...]:

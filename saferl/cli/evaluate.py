@@ -89,20 +89,18 @@ def compiling(cfg: DictConfig, on: bool) -> DictConfig:
     return cfg
 
 
-def trained_policy(cfg: DictConfig, path: Path) -> tuple[TensorDictModuleBase, list[Transform]]:
-    """The policy of a run or checkpoint, with the projector that it drives with.
+def trained_agent(cfg: DictConfig, path: Path) -> Agent:
+    """The agent of a run or checkpoint, its projector as far as the training had come.
 
     Args:
         cfg: the run's configuration.
         path: the run or checkpoint.
     """
     agent = load_agent(cfg, path, "checkpoint")
-    if agent.projector is None:
-        return agent.actor, []
-    if hasattr(agent.projector, "set_progress"):
+    if agent.projector is not None and hasattr(agent.projector, "set_progress"):
         spent = Budget(cfg.episodes, cfg.frames).spent(**progress(path))
         agent.projector.set_progress(spent)
-    return agent.actor, [agent.projector]
+    return agent
 
 
 def on_its_own_task(cfg: DictConfig, trained: DictConfig, overrides: Sequence[str]) -> DictConfig:
@@ -141,6 +139,26 @@ def on_its_own_task(cfg: DictConfig, trained: DictConfig, overrides: Sequence[st
     for key, value in said.items():
         OmegaConf.update(test, key, value)
     return test
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Who is tested.
+
+    Attributes:
+        name: what to call it.
+        policy: acts.
+        transforms: what it drives with.
+        critics: Q_c(s, a) that it has learned, if it has, and their ``limit``.
+        about: what else is known of its training.
+    """
+
+    name: str
+    policy: TensorDictModuleBase
+    transforms: Sequence[Transform] = ()
+    critics: TensorDictModuleBase | None = None
+    limit: float | None = None
+    about: Mapping[str, Any] = field(default_factory=dict)
 
 
 def choose_policy(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,109 +10,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from saferl.modules.attention import EgoAttention, Linear, SceneTokens, SelfAttention
 from saferl.modules.encoder import Encoder
 from saferl.modules.scene import (
     EGO_SCALE,
     MASKED,
     VEHICLE_SCALE,
     check_sizes,
-    feature_scale,
     flat_linear,
     largest,
-    scale_ego,
-    scale_vehicles,
 )
-
-
-class _Linear(nn.Linear):
-    def forward(self, input: Tensor) -> Tensor:
-        return flat_linear(input, self.weight, self.bias)
-
-
-class _SceneTokens(nn.Module):
-    """Embeds the EV and the SVs apart (linear + GELU): tokens [*B, 1 + M, d] and presence."""
-
-    ego_scale: Tensor
-    vehicle_scale: Tensor
-
-    def __init__(self, width: int, ego_scale: Sequence[float], vehicle_scale: Sequence[float]):
-        super().__init__()
-        self.register_buffer("ego_scale", feature_scale("ego_scale", ego_scale))
-        self.register_buffer("vehicle_scale", feature_scale("vehicle_scale", vehicle_scale))
-        self.ego = _Linear(len(ego_scale), width)
-        self.vehicle = _Linear(len(vehicle_scale), width)
-
-    def forward(self, ego: Tensor, vehicles: Tensor) -> tuple[Tensor, Tensor]:
-        features, present = scale_vehicles(vehicles, self.vehicle_scale)
-        ego_token = F.gelu(self.ego(scale_ego(ego, self.ego_scale))).unsqueeze(-2)
-        tokens = torch.cat([ego_token, F.gelu(self.vehicle(features))], dim=-2)
-        # The EV is always there, so no softmax ever runs over absent rows alone. Not F.pad: in float64
-        # torch 2.13 generates C++ from it that does not compile for AVX2.
-        return tokens, torch.cat([present.new_ones((*present.shape[:-1], 1)), present], dim=-1)
-
-
-class _Attention(nn.Module):
-    """What both hops share: the number of heads and the divisor of the logits (AttnE1)."""
-
-    def __init__(self, width: int, heads: int, scale: str):
-        super().__init__()
-        check_sizes(width=width, heads=heads)
-        if width % heads:
-            raise ValueError(f"width must be a multiple of heads, got {width} and {heads}.")
-        if scale not in ("paper", "per_head"):
-            raise ValueError(f"scale must be 'paper' or 'per_head', got {scale!r}.")
-        self.heads = heads
-        self.divisor = math.sqrt(width if scale == "paper" else width // heads)
-        self.merge = _Linear(width, width, bias=False)
-
-
-class _SelfAttention(_Attention):
-    """Multi-head self-attention over all rows: tokens [*B, N, d] -> [*B, N, d]."""
-
-    def __init__(self, width: int, heads: int, scale: str):
-        super().__init__(width, heads, scale)
-        self.query_key_value = _Linear(width, 3 * width, bias=False)
-
-    def forward(self, tokens: Tensor, present: Tensor) -> Tensor:
-        split = self.query_key_value(tokens).unflatten(-1, (3, self.heads, -1))
-        query, key, value = split.unbind(-3)
-        # Keys first: a softmax over a long way through memory is several times faster than over 12 neighbours.
-        logits = torch.einsum("...qhd,...khd->...kqh", query / self.divisor, key)
-        weights = logits.masked_fill(~present[..., None, None], MASKED).softmax(-3)
-        return self.merge(torch.einsum("...kqh,...khd->...qhd", weights, value).flatten(-2))
-
-
-class _EgoAttention(_Attention):
-    """Multi-head attention whose only query is the EV's row.
-
-    One query needs no keys or values of the tokens: with key_j = W_K x_j, a head's logit is
-    x_j . (W_K^T q), and its output W_V (sum_j w_j x_j). Both are exact, and cost O(d^2) for a scene
-    in place of O(N d^2).
-    """
-
-    def __init__(self, width: int, heads: int, scale: str):
-        super().__init__(width, heads, scale)
-        self.query = _Linear(width, width, bias=False)
-        self.key = _Linear(width, width, bias=False)
-        self.value = _Linear(width, width, bias=False)
-
-    def folded_query(self, row: Tensor) -> Tensor:
-        """W_K^T q / divisor of each head: row [*B, d] -> [*B, h, d]."""
-        query = self.query(row).unflatten(-1, (self.heads, -1))
-        weight = self.key.weight.unflatten(0, (self.heads, -1))
-        return torch.einsum("...hk,hkd->...hd", query, weight) / self.divisor
-
-    def folded_value(self, readout: Tensor) -> Tensor:
-        """What a token adds to `readout . output` in each head: readout [d] -> [h, d]."""
-        readout = (readout @ self.merge.weight).unflatten(-1, (self.heads, -1))
-        return torch.einsum("hk,hkd->hd", readout, self.value.weight.unflatten(0, (self.heads, -1)))
-
-    def forward(self, row: Tensor, tokens: Tensor, present: Tensor) -> Tensor:
-        logits = self.folded_query(row) @ tokens.mT
-        weights = logits.masked_fill(~present.unsqueeze(-2), MASKED).softmax(-1)
-        weight = self.value.weight.unflatten(0, (self.heads, -1))
-        heads = torch.einsum("...hd,hkd->...hk", weights @ tokens, weight)
-        return self.merge(heads.flatten(-2))
 
 
 class MMAMPolicyEncoder(nn.Module):
@@ -176,21 +82,42 @@ class MMAMPolicyEncoder(nn.Module):
         if keys not in ("attended", "embedded"):
             raise ValueError(f"keys must be 'attended' or 'embedded', got {keys!r}.")
         self.keys = keys
-        self.tokens = _SceneTokens(width, ego_scale, vehicle_scale)
+        self.tokens = SceneTokens(width, ego_scale, vehicle_scale)
         # With one row to compute, self-attention is ego-attention.
-        first = _SelfAttention if keys == "attended" else _EgoAttention
+        first = SelfAttention if keys == "attended" else EgoAttention
         self.self_attention = first(width, heads, scale)
-        self.ego_attention = _EgoAttention(width, heads, scale)
-        self.layers = nn.ModuleList(_Linear(width, width) for _ in range(depth))
+        self.ego_attention = EgoAttention(width, heads, scale)
+        self.layers = nn.ModuleList(Linear(width, width) for _ in range(depth))
 
-    def forward(self, ego: Tensor, vehicles: Tensor) -> Tensor:
+    def _first_hop(self, ego: Tensor, vehicles: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What the second hop looks from and at: the EV's row [*B, d], tokens [*B, N, d], which are there."""
         tokens, present = self.tokens(ego, vehicles)
         if self.keys == "attended":
             tokens = tokens + self.self_attention(tokens, present)
-            row = tokens[..., 0, :]
-        else:
-            row = tokens[..., 0, :]
-            row = row + self.self_attention(row, tokens, present)
+            return tokens[..., 0, :], tokens, present
+        row = tokens[..., 0, :]
+        return row + self.self_attention(row, tokens, present), tokens, present
+
+    def attention(self, ego: Tensor, vehicles: Tensor) -> Tensor:
+        """The weights of the ego-attention, the second hop, for pictures of what the EV looks at.
+
+        Args:
+            ego, vehicles: as the encoder reads them, [*B, F] and [*B, M, G].
+
+        Returns:
+            [*B, h, M + 1], which sum to 1 over the last dimension: on the EV itself first, then on each row of
+            ``vehicles``, 0 on absent ones.
+
+        Examples:
+            >>> import torch
+            >>> from saferl.modules import MMAMPolicyEncoder
+            >>> MMAMPolicyEncoder(width=32).attention(torch.randn(5, 9), torch.zeros(5, 3, 6))[0, 0]
+            tensor([1., 0., 0., 0.], grad_fn=<SelectBackward0>)
+        """
+        return self.ego_attention.weights(*self._first_hop(ego, vehicles))
+
+    def forward(self, ego: Tensor, vehicles: Tensor) -> Tensor:
+        row, tokens, present = self._first_hop(ego, vehicles)
         row = row + self.ego_attention(row, tokens, present)
         for layer in self.layers:
             row = F.gelu(layer(row))
@@ -253,15 +180,15 @@ class MMAMValue(nn.Module):
     ):
         super().__init__()
         check_sizes(width=width, depth=depth, outputs=outputs)
-        self.tokens = _SceneTokens(width, ego_scale, vehicle_scale)
-        self.action = _Linear(action_dim, width)
-        self.attention = _EgoAttention(width, heads, scale)
+        self.tokens = SceneTokens(width, ego_scale, vehicle_scale)
+        self.action = Linear(action_dim, width)
+        self.attention = EgoAttention(width, heads, scale)
         # On (SV, EV, action), and on (EV, action, the largest of that).
-        self.pair = _Linear(3 * width, width)
-        self.joint = _Linear(3 * width, width)
-        self.layers = nn.ModuleList(_Linear(width, width) for _ in range(depth - 1))
-        self.w_attn = _Linear(width, 1, bias=False)
-        self.w_mlp = _Linear(width, outputs, bias=False)
+        self.pair = Linear(3 * width, width)
+        self.joint = Linear(3 * width, width)
+        self.layers = nn.ModuleList(Linear(width, width) for _ in range(depth - 1))
+        self.w_attn = Linear(width, 1, bias=False)
+        self.w_mlp = Linear(width, outputs, bias=False)
         self.layer_norm = layer_norm
 
     @property

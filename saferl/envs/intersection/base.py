@@ -24,7 +24,9 @@ from saferl.envs.intersection.drivers import DRIVERS
 from saferl.envs.intersection.geometry import ROUTES, ROUTES_OF_TASK, TASK_OF_ROUTE
 from saferl.envs.intersection.observation import FORMS, ROWS, Form, reading
 from saferl.envs.intersection.reward import Reward
+from saferl.envs.intersection.roads import lanes
 from saferl.envs.intersection.spawning import SCENARIOS, Traffic, draw_route
+from saferl.envs.intersection.traffic import Vehicles, vehicle_states
 from saferl.envs.intersection.yielding import PERIOD
 from saferl.envs.seeding import SeededEnv
 from saferl.envs.task import Task
@@ -291,12 +293,19 @@ class IntersectionBase(SeededEnv):
         }
         return TensorDict(self._reals(out), batch_size=self.batch_size, device=self.device)
 
+    def scene(self) -> tuple[Tensor, Vehicles]:
+        """The true states of the egos [B, 6], and the surrounding vehicles [N, B], seen or not."""
+        raise NotImplementedError
+
     def snapshot(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """States of the ego [6] and of the others [N, 6] of one environment, float64.
 
         Row k is vehicle k for the whole episode, and NaN while it is off the road.
         """
-        raise NotImplementedError
+        ego, vehicles = self.scene()
+        others = vehicle_states(vehicles, lanes(vehicles.route, vehicles.s))
+        others = torch.where(vehicles.present.movedim(0, -1)[..., None], others, torch.nan)
+        return ego[index].double().cpu().numpy(), others[index].double().cpu().numpy()
 
     def render(self, index: int) -> np.ndarray | None:
         """A picture [H, W, 3] uint8 of one environment, or None where a backend draws none."""

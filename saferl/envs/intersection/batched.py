@@ -249,14 +249,9 @@ class BatchedIntersection(IntersectionBase):
         self._state, output = self._advance(self._state, action)
         return self._output(self._observation() | output)
 
-    def snapshot(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """States of the ego [6] and of the others [N, 6], float64: row k is vehicle k, NaN while it
-        is not on the road."""
-        state = {key: value[index] for key, value in self._state.items()}
-        vehicles = vehicles_of(state)
-        others = vehicle_states(vehicles, _lanes(state, _LANE)).double()
-        others[~vehicles.present] = torch.nan
-        return state["ego"].double().cpu().numpy(), others.cpu().numpy()
+    def scene(self) -> tuple[Tensor, Vehicles]:
+        """The true states of the egos [B, 6], and the surrounding vehicles [N, B], seen or not."""
+        return self._state["ego"], vehicles_of(self._state)
 
     def render(self, index: int) -> np.ndarray:
         """The scene [600, 600, 3] uint8 of one environment, drawn by highway-env's graphics."""

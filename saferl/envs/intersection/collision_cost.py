@@ -60,8 +60,9 @@ class CollisionCost:
                 f"cost.growth must be 2 numbers with 0 < first <= last, got {self.growth}."
             )
 
-    def __call__(self, ego: Tensor, control: Tensor, vehicles: Tensor, observed: Tensor) -> Tensor:
-        """Cost [...] of a state and action.
+    def shares(self, ego: Tensor, control: Tensor, vehicles: Tensor, observed: Tensor) -> Tensor:
+        """What each vehicle adds to the cost of a state and action, [..., N]: 0 where none of its predicted places meets
+        the ego's.
 
         Args:
             ego: [..., 6].
@@ -83,8 +84,12 @@ class CollisionCost:
         gap = separation(own.at((slice(None), None)), others, scale=beta[:, None])  # [T, N, ...]
         observed = observed.movedim(-1, 0)
         price = (self.initial / self.base_speed) * torch.exp(-self.decay * beta)
-        total = torch.where((gap <= 0) & observed, price[:, None], 0.0).sum((0, 1))
-        return total * speed / observed.sum(0).clamp_min(1)
+        each = torch.where((gap <= 0) & observed, price[:, None], 0.0).sum(0)
+        return (each * speed / observed.sum(0).clamp_min(1)).movedim(0, -1)
+
+    def __call__(self, ego: Tensor, control: Tensor, vehicles: Tensor, observed: Tensor) -> Tensor:
+        """Cost [...] of a state and action, the sum of its :meth:`shares`."""
+        return self.shares(ego, control, vehicles, observed).sum(-1)
 
     def with_crash(self, predicted: Tensor, crashed: Tensor) -> Tensor:
         """Cost [...] of a decision: its predicted collisions, and whether it ended in a crash, bool [...]."""

@@ -7,10 +7,12 @@ import dataclasses
 import numpy as np
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 
 from saferl.envs.intersection.base import OUTCOMES, IntersectionBase, Scenario
 from saferl.envs.intersection.geometry import ROUTES
 from saferl.envs.intersection.highway import IntersectionEnv
+from saferl.envs.intersection.traffic import Vehicles
 from saferl.envs.seeding import ReplayedEnv
 
 
@@ -63,14 +65,11 @@ class HighwayIntersection(ReplayedEnv, IntersectionBase):
         ends = {"terminated": terminated, "truncated": truncated, "done": terminated or truncated}
         return {**self._entry(observation, info), "reward": reward, **ends}
 
-    def snapshot(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """States of the ego [6] and of the others [N, 6], float64: row k is vehicle k, NaN while it
-        is not on the road."""
-        ego, there = self.envs[index].snapshot()
-        present = self.envs[index].road.surrounding.present.numpy()
-        others = np.full((len(present), 6), np.nan)
-        others[present] = there
-        return ego, others
+    def scene(self) -> tuple[Tensor, Vehicles]:
+        """The true states of the egos [B, 6], and the surrounding vehicles [N, B], seen or not; on the CPU."""
+        egos = torch.stack([env.ego.state for env in self.envs])
+        fields = zip(*(env.road.surrounding for env in self.envs), strict=True)
+        return egos, Vehicles(*(torch.stack(field, -1) for field in fields))
 
     def render(self, index: int) -> np.ndarray | None:
         return self.envs[index].render()

@@ -20,6 +20,8 @@ T = N + 1 counts the ego too, last.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -43,6 +45,52 @@ def _and(values: Tensor, ego: Tensor) -> Tensor:
     return torch.cat([values, ego[None]])
 
 
+class _Order(NamedTuple):
+    """Everybody in the order of the rules, each [T, ...] but for the ego's ``pace`` along its route [...], m/s.
+
+    Attributes:
+        s: arc length, m. there: on the road. present: not yet out of the box. inside: has entered and is not out.
+        entered: when, s, or inf. rank: who is higher goes first.
+    """
+
+    s: Tensor
+    pace: Tensor
+    there: Tensor
+    present: Tensor
+    inside: Tensor
+    entered: Tensor
+    rank: Tensor
+
+
+def _ranked(vehicles: Vehicles, lane: Lanes, own: Lanes, ego: Tensor, time: Tensor) -> _Order:
+    ego_s, _ = lane_project(own, ego[..., 0], ego[..., 1])
+    turned = ego[..., 4] - lane_frames(own, ego_s)[1]
+    ego_pace = (torch.hypot(ego[..., 2], ego[..., 3]) * torch.cos(turned)).clamp_min(0.0)
+
+    all_s, all_speed = _and(vehicles.s, ego_s), _and(vehicles.speed, ego_pace)
+    yes = torch.ones_like(ego_s, dtype=torch.bool)
+    there = _and(vehicles.present, yes)
+    to_line = ARM - LENGTH / 2 - all_s
+    unable = ~_and(vehicles.held, ~yes) & (all_speed.square() > 2 * COMMIT * (to_line - 0.5))
+    present = there & (all_s < _and(lane.out, own.out) + LENGTH / 2)
+    inside = present & ((to_line < 0) | unable)
+    entered = torch.where(inside, torch.minimum(vehicles.entered, time), torch.inf)
+
+    # Rank: order of entry, then road priority, then time to the line; ties by distance and number.
+    arrival = to_line.clamp_min(0.0) / all_speed.clamp_min(1.0)
+    right_of_way = _and(lane.priority, own.priority) * 100.0 - arrival
+    rank = torch.where(inside, 1000.0 - entered.clamp_max(600.0), right_of_way)
+    return _Order(all_s, ego_pace, there, present, inside, entered, rank)
+
+
+def has_priority(vehicles: Vehicles, lane: Lanes, own: Lanes, ego: Tensor, time: Tensor) -> Tensor:
+    """Which vehicles [N, ...], bool, rank above the ego by the rules of the road; arguments as of :func:`road_rules`."""
+    order = _ranked(vehicles, lane, own, ego, time)
+    s, rank = order.s, order.rank
+    tie = (rank[:-1] == rank[-1:]) & (s[:-1] >= s[-1:])
+    return vehicles.present & ((rank[:-1] > rank[-1:]) | tie)
+
+
 def road_rules(
     vehicles: Vehicles,
     lane: Lanes,
@@ -61,23 +109,9 @@ def road_rules(
         time: since the start of the episode [...], s.
     """
     s, speed, count = vehicles.s, vehicles.speed, len(vehicles.s)
-    ego_s, _ = lane_project(own, ego[..., 0], ego[..., 1])
-    turned = ego[..., 4] - lane_frames(own, ego_s)[1]
-    ego_pace = (torch.hypot(ego[..., 2], ego[..., 3]) * torch.cos(turned)).clamp_min(0.0)
-
-    all_s, all_speed = _and(s, ego_s), _and(speed, ego_pace)
-    yes = torch.ones_like(ego_s, dtype=torch.bool)
-    there = _and(vehicles.present, yes)
-    present = there & (all_s < _and(lane.out, own.out) + LENGTH / 2)  # not yet out of the box
-    to_line = ARM - LENGTH / 2 - all_s
-    unable = ~_and(vehicles.held, ~yes) & (all_speed.square() > 2 * COMMIT * (to_line - 0.5))
-    inside = present & ((to_line < 0) | unable)
-    entered = torch.where(inside, torch.minimum(vehicles.entered, time), torch.inf)
-
-    # Rank: order of entry, then road priority, then time to the line; ties by distance and number.
-    arrival = to_line.clamp_min(0.0) / all_speed.clamp_min(1.0)
-    right_of_way = _and(lane.priority, own.priority) * 100.0 - arrival
-    rank = torch.where(inside, 1000.0 - entered.clamp_max(600.0), right_of_way)
+    order = _ranked(vehicles, lane, own, ego, time)
+    all_s, ego_pace, there, present, inside, entered, rank = order
+    ego_s = all_s[-1]
     number = torch.arange(count + 1, device=s.device).reshape(-1, *[1] * ego_s.ndim)
     mine, their = (slice(0, count), None), (None,)  # i and j of pairs [N, T, ...]
     farther = all_s[their] > all_s[mine]

@@ -188,7 +188,16 @@ class SafetyProjector(Transform):
         return self._box
 
     @torch.no_grad()
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def correct(self, tensordict: TensorDictBase, **box: Any) -> TensorDict:
+        """What is to be executed in place of the proposed action, without an environment.
+
+        Args:
+            tensordict: [*B], with what the risk reads; stays as it is.
+            **box: ``low`` and ``high`` of the actions, see :func:`saferl.modules.project`.
+
+        Returns:
+            The entries that a step writes under ``next``, [*B].
+        """
         inputs = tensordict.select(*self.risk.in_keys).reshape(-1)
         action = inputs.get(self.action_key)
 
@@ -201,12 +210,12 @@ class SafetyProjector(Transform):
                 # Only the risky samples are worth up to `steps` evaluations.
                 if isinstance(rows, Tensor):
                     risk, _ = self._see(inputs[rows])
-                result = project(risk, action[rows], self.limit, **self.settings, **self._bounds())
+                result = project(risk, action[rows], self.limit, **self.settings, **box)
                 executed[rows], after[rows] = result.action, result.risk_after
                 steps[rows] = result.steps.to(steps)
             self.latencies.append(time.perf_counter() - begin)
 
-        report = TensorDict(
+        return TensorDict(
             {
                 "action_executed": executed,
                 "risk_before": before.float().unsqueeze(-1),
@@ -217,6 +226,9 @@ class SafetyProjector(Transform):
             },
             inputs.batch_size,
         ).reshape(tensordict.batch_size)
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        report = self.correct(tensordict, **self._bounds())
         # Inner transforms may rescale the action from here on: the report stays in policy units.
         tensordict.set(_STASH, report)
         return tensordict.set(self.action_key, report.get("action_executed").clone())
