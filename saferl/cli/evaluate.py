@@ -1,4 +1,4 @@
-"""Test a policy, and draw its first episodes."""
+"""Test a policy, and draw episodes of the test."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from saferl.config.locate import pretrained_run
 from saferl.envs.task import Task
 from saferl.evaluation.play import envs_at_once
 from saferl.evaluation.play import evaluate as play_episodes
+from saferl.evaluation.progress import bar
 from saferl.evaluation.rows import write
 from saferl.evaluation.statistics import table
 from saferl.training.progress import Budget
@@ -42,23 +43,47 @@ def pictures(
     rows: list[dict],
     out: Path,
     device: str,
+    name: str,
+    form: str,
 ) -> None:
-    """An animation and a figure of each of these episodes of a test."""
+    """A figure of each of these episodes of a test, and an animation unless ``form`` is ``png``."""
     if not rows:
         return
-    with closing(build_env(env, task, 1, 0, device_of(device), transforms)) as alone:
-        for row in rows:
-            log.info("%s", task.draw(policy, alone, row, out))
+    with (
+        closing(build_env(env, task, len(rows), 0, device_of(device), transforms)) as several,
+        bar(total=len(rows), desc="draw", unit="episode") as shown,
+    ):
+        made = []
+        for path in task.draw(policy, several, rows, out, name, form):
+            made.append(path)
+            shown.update()
+    log.info("Pictures: %s", ", ".join(map(str, made)))
+
+
+def drawn(rows: list[dict], cfg: DictConfig) -> list[dict]:
+    """Those of a test's episodes that ``draw`` and ``draw_most`` or ``episode`` ask for."""
+    if (numbers := cfg.get("episode")) is not None:
+        return [rows[number] for number in ([numbers] if isinstance(numbers, int) else numbers)]
+    if cfg.draw == "none":
+        return []
+    column = {"collisions": "collision"}.get(cfg.draw, cfg.draw)
+    found = [row for row in rows if column == "all" or row[column]]
+    if len(found) > cfg.draw_most or not found:
+        few = f"the first {cfg.draw_most} are drawn (draw_most)" if found else "none is drawn"
+        log.info("draw=%s: %d of %d episodes, %s.", cfg.draw, len(found), len(rows), few)
+    return found[: cfg.draw_most]
 
 
 def evaluate(cfg: DictConfig) -> None:
-    """Test a policy that the configuration names, and draw its first episodes."""
+    """Test a policy that the configuration names, and draw those episodes that it asks for."""
     check_targets(cfg)
     torch.set_num_threads(cfg.threads)
     OmegaConf.resolve(cfg)
     cfg, task, policy, transforms, name, about = choose_policy(cfg)
-    if cfg.gif and not task.pictures:
-        raise ValueError(f"gif must be 0, as task={task.task} draws no pictures, got {cfg.gif}.")
+    if not task.pictures and (cfg.draw != "none" or cfg.episode is not None):
+        raise ValueError(
+            f"draw must be none and episode null, as task={task.task} draws no pictures."
+        )
     title = f"{name.partition(' ')[0]}-{task.task}-seed{cfg.seed}"
     folder = f"evaluation/{title}/{datetime.now():%Y-%m-%d_%H-%M-%S-%f}"
     out = job_folder() or Path(folder if cfg.out is None else str(cfg.out))
@@ -77,7 +102,8 @@ def evaluate(cfg: DictConfig) -> None:
         policy_name=name,
         **about,
     )
-    pictures(cfg.env, task, policy, transforms, rows[: cfg.gif], out, cfg.device)
+    chosen, form = drawn(rows, cfg), cfg.draw_format
+    pictures(cfg.env, task, policy, transforms, chosen, out, cfg.device, name, form)
 
 
 def compiling(cfg: DictConfig, on: bool) -> DictConfig:

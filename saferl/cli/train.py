@@ -17,7 +17,7 @@ from torchrl.envs.transforms import Transform
 from saferl.algorithms.assemble import build_trainer, complete
 from saferl.checkpoint.lock import alone
 from saferl.checkpoint.run import CONFIG, begun, run_config, run_folder
-from saferl.cli.evaluate import compiling, measure, pictures, trained_policy
+from saferl.cli.evaluate import compiling, drawn, measure, pictures, trained_policy
 from saferl.cli.launch import job_folder
 from saferl.config.limits import check_limits
 from saferl.evaluation.compare import TESTED, side_by_side
@@ -79,7 +79,7 @@ def train(cfg: DictConfig) -> None:
 
 
 def closing_test(cfg: DictConfig, run: Path) -> None:
-    """Test what a run has learned, beside the scripted drivers that it names, and draw its first episodes."""
+    """Test what a run has learned, beside the scripted drivers that it names, and draw episodes of it."""
     settings = cfg.evaluation
     task = hydra.utils.instantiate(cfg.task).as_test()
     policy, transforms = trained_policy(cfg, run)
@@ -113,8 +113,17 @@ def closing_test(cfg: DictConfig, run: Path) -> None:
             for name, rows in results.items()
         ]
         log.info("\n%s\n%s", title, side_by_side(runs, tuple(FIGURES)))
+    chosen = drawn(results[cfg.algo_name], settings)
     pictures(
-        cfg.env, task, policy, transforms, results[cfg.algo_name][: settings.gif], out, cfg.device
+        cfg.env,
+        task,
+        policy,
+        transforms,
+        chosen,
+        out,
+        cfg.device,
+        cfg.algo_name,
+        settings.draw_format,
     )
 
 

@@ -54,9 +54,9 @@ def check_task(evaluation: Any, task: Task) -> None:
         if name not in task.drivers:
             choices = ", ".join(task.drivers) or f"none: task={task.task} has no drivers"
             raise ValueError(f"evaluation.drivers must be among {choices}, got {name!r}.")
-    if evaluation.gif and not task.pictures:
+    if evaluation.draw != "none" and not task.pictures:
         raise ValueError(
-            f"evaluation.gif must be 0, as task={task.task} draws no pictures, got {evaluation.gif}."
+            f"evaluation.draw must be none, as task={task.task} draws no pictures, got {evaluation.draw}."
         )
 
 

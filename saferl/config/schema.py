@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields, is_dataclass
+from importlib.util import find_spec
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
@@ -14,6 +15,8 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 
 ORDERS = ("joint", "sequential")
 DEVICES = ("auto", "cpu", "cuda")
+DRAWN = ("none", "all", "collisions", "frozen", "success")
+FORMATS = ("gif", "mp4", "png")
 
 
 def at_least(least: float, settings: Any, *names: str, prefix: str = "") -> None:
@@ -45,6 +48,17 @@ def one_of(choices: tuple[str, ...], settings: Any, name: str, prefix: str = "")
     if getattr(settings, name) not in choices:
         raise ValueError(
             f"{prefix}{name} must be one of {', '.join(choices)}, got {getattr(settings, name)!r}."
+        )
+
+
+def drawing(settings: Any, prefix: str = "") -> None:
+    """Refuse pictures of no kind, and those that lack the package that makes them."""
+    one_of(DRAWN, settings, "draw", prefix)
+    at_least(1, settings, "draw_most", prefix=prefix)
+    one_of(FORMATS, settings, "draw_format", prefix)
+    if settings.draw_format == "mp4" and find_spec("imageio_ffmpeg") is None:
+        raise ValueError(
+            f"{prefix}draw_format=mp4 needs imageio-ffmpeg: pip install 'saferl[video]'."
         )
 
 
@@ -188,11 +202,13 @@ class ClosingTest:
     episodes: int = MISSING
     num_envs: int = MISSING
     drivers: list[str] = MISSING
-    gif: int = MISSING
+    draw: str = MISSING
+    draw_most: int = MISSING
+    draw_format: str = MISSING
 
     def __post_init__(self):
         at_least(1, self, "episodes", "num_envs", prefix="evaluation.")
-        at_least(0, self, "gif", prefix="evaluation.")
+        drawing(self, prefix="evaluation.")
 
 
 @dataclass
@@ -258,13 +274,26 @@ class Test:
     device: str = MISSING
     threads: int = MISSING
     compile: bool = MISSING
-    gif: int = MISSING
+    draw: str = MISSING
+    episode: Any = MISSING
+    draw_most: int = MISSING
+    draw_format: str = MISSING
 
     def __post_init__(self):
         at_least(1, self, "episodes", "threads")
         seeded(self)
-        at_least(0, self, "gif")
         one_of(DEVICES, self, "device")
+        drawing(self)
+        if self.episode is None:
+            return
+        if self.draw != "none":
+            raise ValueError(f"Give one of draw and episode, got {self.draw} and {self.episode}.")
+        for number in self.episode if isinstance(self.episode, list) else [self.episode]:
+            if type(number) is not int or not 0 <= number < self.episodes:
+                raise ValueError(
+                    "episode must be a number or a list of numbers, each >= 0 and < "
+                    f"episodes={self.episodes}, got {self.episode}."
+                )
 
 
 def _known(node: DictConfig, path: str = "") -> None:

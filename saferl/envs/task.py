@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -112,15 +112,25 @@ class Task:
         """What the file of a test says of its task."""
         return dataclasses.asdict(self)  # pyright: ignore[reportArgumentType]
 
-    def draw(self, policy: TensorDictModuleBase, env: EnvBase, row: dict, out: Path) -> Path:
-        """Play an episode of a test again and draw it.
+    def draw(
+        self,
+        policy: TensorDictModuleBase,
+        env: EnvBase,
+        rows: Sequence[dict],
+        out: Path,
+        name: str = "",
+        form: str = "gif",
+    ) -> Iterator[Path]:
+        """Play episodes of a test again, side by side, and draw them.
 
         Args:
-            policy, env: as the test played it, the environment of batch size 1.
-            row: of the episode, with its ``episode`` number and ``seed``.
+            policy, env: as the test played it, but as many environments as episodes.
+            rows: of the episodes, with their ``episode`` number and ``seed``.
             out: folder of the pictures.
+            name: what to call the policy.
+            form: ``gif`` or ``mp4`` for an animation beside each figure, ``png`` for the figure alone.
 
-        Returns:
-            The path of one of them.
+        Yields:
+            The path of each figure, once it is there.
         """
         raise NotImplementedError

@@ -176,7 +176,8 @@ def test_a_test_does_not_change_a_task_that_is_not_the_roads(tmp_path: Path, ref
     for option, words in (
         ("task=lt", "task: this policy's task is cart, which a test does not change"),
         ("task.scenario=dense", "task.scenario: this policy's task is cart"),
-        ("gif=1", "gif must be 0, as task=cart draws no pictures, got 1"),
+        ("draw=all", "draw must be none and episode null, as task=cart draws no pictures"),
+        ("episode=1", "draw must be none and episode null, as task=cart draws no pictures"),
     ):
         assert words in refusal(*TEST, f"checkpoint={run}", option, "episodes=2", "out=test")
     assert not (tmp_path / "test").exists()
@@ -248,7 +249,7 @@ def test_the_readmes_everyday_commands_work_in_order(command, tmp_path: Path):
     block = readme.partition("## Everyday commands")[2].split("```")[1]
     lines = [line.partition("#")[0].split() for line in block.splitlines() if "-m saferl" in line]
     assert len(lines) == 12
-    small = {"saferl": (*SMALL, *EMPTY), "saferl.evaluate": (*EMPTY, "episodes=1", "gif=0")}
+    small = {"saferl": (*SMALL, *EMPTY), "saferl.evaluate": (*EMPTY, "episodes=1", "draw=none")}
     for _, _, module, *arguments in lines:
         name = module.partition(".")[2] or "train"
         if "--help" in arguments:

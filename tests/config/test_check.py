@@ -45,7 +45,7 @@ MISTAKES = [
     ("gamma=nan", "gamma must be >= 0 and <= 1, got nan."),
     (
         "evaluation=3",
-        "evaluation must be a mapping of episodes, num_envs, drivers, gif, got 3.",
+        "evaluation must be a mapping of episodes, num_envs, drivers, draw, draw_most, draw_format, got 3.",
     ),
     ("lagrange.multiplier=3", "lagrange.multiplier must be a mapping of _target_, "),
     ("task.reward=3", "task.reward must be a mapping of reading, risk_shaping, "),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import json
 import math
@@ -194,7 +195,12 @@ def test_a_runs_closing_test_is_the_evaluation_of_its_checkpoint(tmp_path: Path,
 def test_a_training_ends_beside_the_drivers_that_it_names_and_with_pictures(
     tmp_path: Path, command, capsys
 ):
-    beside = ("evaluation.drivers=[blind,scripted]", "evaluation.episodes=3", "evaluation.gif=1")
+    beside = (
+        "evaluation.drivers=[blind,scripted]",
+        "evaluation.episodes=3",
+        "evaluation.draw=all",
+        "evaluation.draw_most=1",
+    )
     command("train", "config", *SMALL, *EMPTY, "algo=sac", "task.duration=2", *beside, "out=run")
     command(
         "evaluate", "evaluate", "policy=blind", *EMPTY, "task.duration=2", "episodes=3", "out=b"
@@ -205,10 +211,47 @@ def test_a_training_ends_beside_the_drivers_that_it_names_and_with_pictures(
     )
     assert all(ours.get(name) == theirs.get(name) for name in FIGURES)
     assert (tmp_path / "run/evaluation/episode_0.gif").is_file()
-    assert (tmp_path / "run/evaluation/episode_0.png").is_file()
+    drawn = [path.name for path in (tmp_path / "run/evaluation").glob("*.png")]
+    assert drawn == ["episode_0.png"]
     text = capsys.readouterr().out.partition("The same 3 episodes of gs")[2]
     rows = [line.split()[0] for line in text.splitlines()[2:5]]
     assert rows == ["sac", "blind", "scripted"] and "SR %" in text
+
+
+@pytest.mark.parametrize(
+    ("asked", "column", "most"),
+    [("collisions", "collision", 1), ("frozen", "frozen", 9), ("all", None, 2)],
+)
+def test_a_test_draws_the_first_of_the_episodes_that_are_asked_for(
+    asked: str, column: str | None, most: int, tmp_path: Path, command, capsys
+):
+    traffic = ("policy=blind", "task=gs", "env.num_envs=8", "episodes=8", "draw_format=png")
+    command("evaluate", "evaluate", *traffic, f"draw={asked}", f"draw_most={most}", "out=test")
+    rows = [*csv.DictReader((tmp_path / "test/episodes.csv").open())]
+    found = [row["episode"] for row in rows if column is None or row[column] == "1"]
+    names = {path.name for path in (tmp_path / "test").glob("*.png")}
+    assert names == {f"episode_{number}.png" for number in found[:most]}
+    told = f"draw={asked}: {len(found)} of 8 episodes" in capsys.readouterr().out
+    assert told == (len(found) > most or not found)
+
+
+def test_a_test_draws_episodes_by_their_numbers(tmp_path: Path, command):
+    short = ("policy=blind", *EMPTY, "task.duration=1", "episodes=4", "draw_format=png")
+    for asked, numbers in (("2", {2}), ("[3,1]", {1, 3})):
+        command("evaluate", "evaluate", *short, f"episode={asked}", f"out=test{asked}")
+        names = {path.name for path in (tmp_path / f"test{asked}").glob("*.png")}
+        assert names == {f"episode_{number}.png" for number in numbers}
+
+
+def test_without_its_package_an_mp4_is_refused_with_the_command_that_installs_it(
+    refusal, monkeypatch, tmp_path: Path
+):
+    monkeypatch.setattr("saferl.config.schema.find_spec", lambda name: None)
+    line = refusal("evaluate", "evaluate", "policy=blind", "draw=all", "draw_format=mp4")
+    assert line.endswith("draw_format=mp4 needs imageio-ffmpeg: pip install 'saferl[video]'.")
+    line = refusal("train", "config", "evaluation.draw_format=mp4")
+    assert line.startswith("error: evaluation.draw_format=mp4 needs imageio-ffmpeg")
+    assert not [*tmp_path.iterdir()]
 
 
 def test_the_command_line_alone_changes_a_runs_own_task():

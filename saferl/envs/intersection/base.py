@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -227,11 +227,19 @@ class Scenario(Task):
             "policy_frequency": self.policy_frequency,
         }
 
-    def draw(self, policy: TensorDictModuleBase, env: EnvBase, row: dict, out: Path) -> Path:
-        """An animation ``episode_N.gif`` and a figure ``episode_N.png``, whose path is returned."""
+    def draw(
+        self,
+        policy: TensorDictModuleBase,
+        env: EnvBase,
+        rows: Sequence[dict],
+        out: Path,
+        name: str = "",
+        form: str = "gif",
+    ) -> Iterator[Path]:
+        """``episode_N.png``, and ``episode_N.gif`` or ``episode_N.mp4``."""
         from saferl.envs.intersection.pictures import draw  # late: few want pictures
 
-        return draw(policy, env, row, out)
+        return draw(policy, env, rows, out, name, form)
 
     @property
     def form(self) -> Form:
@@ -297,8 +305,9 @@ class IntersectionBase(SeededEnv):
         """The true states of the egos [B, 6], and the surrounding vehicles [N, B], seen or not."""
         raise NotImplementedError
 
-    def snapshot(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """States of the ego [6] and of the others [N, 6] of one environment, float64.
+    def snapshot(self, index: int | slice) -> tuple[np.ndarray, np.ndarray]:
+        """States of the ego [6] and of the others [N, 6] of one environment, float64; of a slice of K
+        environments [K, 6] and [K, N, 6].
 
         Row k is vehicle k for the whole episode, and NaN while it is off the road.
         """

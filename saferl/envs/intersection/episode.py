@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -22,6 +23,16 @@ from saferl.envs.intersection.geometry import (
 )
 from saferl.envs.intersection.reward import Reward
 
+#: Routes as they are told to people.
+WORDS = {
+    "lt": "left turn",
+    "gs_inner": "straight on in the inner lane",
+    "gs_outer": "straight on in the outer lane",
+    "rt": "right turn",
+}
+#: Which end is which outcome; of two the later one counts.
+OUTCOMES = {"success": "success", "offroad": "left_road", "collision": "hit_vehicle"}
+
 
 @dataclass
 class Episode:
@@ -32,6 +43,7 @@ class Episode:
         dt: seconds between decisions.
         outcome: ``success``, ``hit_vehicle``, ``left_road`` or ``frozen``, as in ``episodes.csv``.
         number: of the episode in its test, if it is of one.
+        policy: who drives.
         reference: speed that the reward asks for, m/s.
         ego: states [6], one more than decisions. others: states [N, 6] likewise, row k of vehicle k
             and NaN while it is not on the road.
@@ -43,6 +55,7 @@ class Episode:
     dt: float
     outcome: str = "frozen"
     number: int | None = None
+    policy: str = ""
     reference: float = Reward.speed
     ego: list[np.ndarray] = field(default_factory=list)
     others: list[np.ndarray] = field(default_factory=list)
@@ -93,49 +106,62 @@ class Episode:
     def title(self) -> str:
         """What a picture is headed with."""
         name = f"Seed {self.seed}" if self.number is None else f"Episode {self.number}"
-        collision = self.outcome in ("hit_vehicle", "left_road")
-        return f"{name}: " + (f"collision ({self.outcome})" if collision else self.outcome)
+        return f"{name}: {self.event}"
+
+    @property
+    def about(self) -> str:
+        """Who drives where, in words."""
+        who = [self.policy] if self.policy else []
+        return ", ".join([*who, WORDS[self.route], f"seed {self.seed}"])
 
 
 @torch.no_grad()
-def record(policy: TensorDictModuleBase, env: EnvBase, seed: int) -> Episode:
-    """Play one episode of an environment of batch size 1 with the policy's mean action.
+def record(
+    policy: TensorDictModuleBase, env: EnvBase, seeds: Sequence[int], name: str = ""
+) -> list[Episode]:
+    """Play these episodes side by side with the policy's mean action.
+
+    Args:
+        policy: reads observations, writes ``action``.
+        env: on either backend, of the batch size [B].
+        seeds: B of them.
+        name: what to call the policy.
 
     Raises:
-        ValueError: another batch size.
+        ValueError: another number of seeds.
     """
-    if env.batch_size != torch.Size([1]):
-        raise ValueError(f"record needs num_envs=1, got batch size {tuple(env.batch_size)}.")
+    if env.batch_size != torch.Size([len(seeds)]):
+        raise ValueError(
+            f"record needs num_envs={len(seeds)}, got batch size {tuple(env.batch_size)}."
+        )
     base: Any = env.base_env if isinstance(env, TransformedEnv) else env
-    tensordict = env.reset(seeds=torch.tensor([seed]))
-    task = base.task
-    episode = Episode(
-        seed,
-        ROUTES[int(tensordict["route"])],
-        1.0 / task.policy_frequency,
-        reference=task.reward.speed,
-    )
+    tensordict = env.reset(seeds=torch.tensor(seeds, device=env.device))
+    dt, reference = 1.0 / base.task.policy_frequency, base.task.reward.speed
+    episodes = [
+        Episode(seed, ROUTES[route], dt, policy=name, reference=reference)
+        for seed, route in zip(seeds, tensordict["route"].flatten().tolist(), strict=True)
+    ]
+    going = dict(enumerate(episodes))
 
     def look() -> None:
-        ego, others = base.snapshot(0)
-        episode.ego.append(ego)
-        episode.others.append(others)
+        ego, others = base.snapshot(slice(None))
+        for index, episode in going.items():
+            episode.ego.append(ego[index])
+            episode.others.append(others[index])
 
     look()
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        while True:
+        while going:
             tensordict = env.step(policy(tensordict))
             look()
             after = tensordict["next"]
-            episode.corrected.append(bool(after.get("intervened", torch.tensor(False))))
-            if after["done"].item():
-                break
+            corrected = after.get("intervened", torch.zeros_like(after["done"]))
+            for index, episode in [*going.items()]:
+                episode.corrected.append(bool(corrected[index]))
+                if after["done"][index]:
+                    for key, outcome in OUTCOMES.items():
+                        if after[key][index]:
+                            episode.outcome = outcome
+                    del going[index]
             tensordict = env.step_mdp(tensordict)
-    for key, outcome in (
-        ("success", "success"),
-        ("offroad", "left_road"),
-        ("collision", "hit_vehicle"),
-    ):
-        if after[key].item():
-            episode.outcome = outcome
-    return episode
+    return episodes
