@@ -24,8 +24,8 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.transforms import Transform
 
+from saferl.algorithms.policy import trained_agent
 from saferl.checkpoint.run import run_config
-from saferl.cli.evaluate import trained_policy
 from saferl.envs.intersection import BatchedIntersection, HighwayIntersection, Scenario
 from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver
 from saferl.evaluation.play import envs_at_once, evaluate
@@ -85,7 +85,8 @@ def main() -> None:
         cfg = run_config(run)
         cfg.device = "cpu"
         scenario = hydra.utils.instantiate(cfg.task)
-        policies[run.name] = (*trained_policy(cfg, run), {"rows": scenario.rows})
+        agent = trained_agent(cfg, run)
+        policies[run.name] = (agent.actor, agent.transforms, {"rows": scenario.rows})
 
     result: dict[str, Any] = {"episodes": options.episodes, "rates": {}, "transfer": {}}
     failed, compared, same, played = 0, 0, 0, 0

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import logging
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -18,45 +20,85 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.transforms import Transform
 
-from saferl.algorithms.assemble import build_env, load_agent
+from saferl.algorithms.assemble import build_env
 from saferl.algorithms.parts import device_of, offered
-from saferl.checkpoint.run import progress, run_config
+from saferl.algorithms.policy import trained_agent
+from saferl.checkpoint.run import run_config
 from saferl.cli.launch import job_folder
 from saferl.config.check import check_targets
 from saferl.config.locate import pretrained_run
+from saferl.envs.intersection import Scenario
+from saferl.envs.intersection.true_scene import TrueScene
 from saferl.envs.task import Task
+from saferl.evaluation.crashes import explain
+from saferl.evaluation.crashes import table as crash_table
 from saferl.evaluation.play import envs_at_once
 from saferl.evaluation.play import evaluate as play_episodes
 from saferl.evaluation.progress import bar
 from saferl.evaluation.rows import write
 from saferl.evaluation.statistics import table
-from saferl.training.progress import Budget
+from saferl.evaluation.trace import record
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Who is tested.
+
+    Attributes:
+        name: what to call it.
+        policy: acts.
+        transforms: what it drives with.
+        critics: Q_c(s, a) that it has learned, if it has, and their ``limit``.
+        about: what else is known of its training.
+    """
+
+    name: str
+    policy: TensorDictModuleBase
+    transforms: Sequence[Transform] = ()
+    critics: TensorDictModuleBase | None = None
+    limit: float | None = None
+    about: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def trained(cls, name: str, cfg: DictConfig, path: Path, project: bool = True) -> Candidate:
+        """The policy of a run or checkpoint.
+
+        Args:
+            name: what to call it.
+            cfg: the run's configuration.
+            path: the run or checkpoint.
+            project: whether it drives with its projector, if it has one.
+        """
+        agent = trained_agent(cfg, path)
+        transforms = agent.transforms if project else ()
+        about = {"cost_limit": cfg.cost_limit}
+        return cls(name, agent.actor, transforms, agent.risk, cfg.risk_limit, about)
 
 
 def pictures(
     env: DictConfig,
     task: Task,
-    policy: TensorDictModuleBase,
-    transforms: Sequence[Transform],
+    who: Candidate,
     rows: list[dict],
     out: Path,
     device: str,
-    name: str,
     form: str,
 ) -> None:
     """A figure of each of these episodes of a test, and an animation unless ``form`` is ``png``."""
     if not rows:
         return
     with (
-        closing(build_env(env, task, len(rows), 0, device_of(device), transforms)) as several,
+        closing(build_env(env, task, len(rows), 0, device_of(device), who.transforms)) as several,
         bar(total=len(rows), desc="draw", unit="episode") as shown,
     ):
         made = []
-        for path in task.draw(policy, several, rows, out, name, form):
+        for path in task.draw(who.policy, several, rows, out, who.name, form):
             made.append(path)
             shown.update()
+    for transform in who.transforms:
+        transform.reset_parent()
     log.info("Pictures: %s", ", ".join(map(str, made)))
 
 
@@ -75,16 +117,18 @@ def drawn(rows: list[dict], cfg: DictConfig) -> list[dict]:
 
 
 def evaluate(cfg: DictConfig) -> None:
-    """Test a policy that the configuration names, and draw those episodes that it asks for."""
+    """Test a policy that the configuration names, and draw, trace and explain those episodes that it asks for."""
     check_targets(cfg)
     torch.set_num_threads(cfg.threads)
     OmegaConf.resolve(cfg)
-    cfg, task, policy, transforms, name, about = choose_policy(cfg)
+    cfg, task, who = choose_policy(cfg)
     if not task.pictures and (cfg.draw != "none" or cfg.episode is not None):
         raise ValueError(
             f"draw must be none and episode null, as task={task.task} draws no pictures."
         )
-    title = f"{name.partition(' ')[0]}-{task.task}-seed{cfg.seed}"
+    if (cfg.trace != "none" or cfg.why) and not isinstance(task, Scenario):
+        raise ValueError(f"trace must be none and why false, as task={task.task} is not the road.")
+    title = f"{who.name.partition(' ')[0]}-{task.task}-seed{cfg.seed}"
     folder = f"evaluation/{title}/{datetime.now():%Y-%m-%d_%H-%M-%S-%f}"
     out = job_folder() or Path(folder if cfg.out is None else str(cfg.out))
     if (out / "metrics.json").exists():
@@ -92,18 +136,42 @@ def evaluate(cfg: DictConfig) -> None:
     rows = measure(
         cfg.env,
         task,
-        policy,
-        transforms,
+        who,
         out=out,
         num_envs=cfg.env.num_envs,
         episodes=cfg.episodes,
         seed=cfg.seed,
         device=cfg.device,
-        policy_name=name,
-        **about,
     )
-    chosen, form = drawn(rows, cfg), cfg.draw_format
-    pictures(cfg.env, task, policy, transforms, chosen, out, cfg.device, name, form)
+    pictures(cfg.env, task, who, drawn(rows, cfg), out, cfg.device, cfg.draw_format)
+    if isinstance(task, Scenario):
+        look_into(cfg, task, who, rows, out)
+
+
+def look_into(cfg: DictConfig, task: Scenario, who: Candidate, rows: list[dict], out: Path) -> None:
+    """Write ``trace.npz`` and ``crashes.csv`` of a test, as far as ``trace`` and ``why`` ask for them."""
+    chosen = rows if cfg.trace == "all" else [row for row in rows if row["collision"]]
+    traced = None
+    if chosen and (cfg.trace != "none" or cfg.why):
+        transforms = [TrueScene(), *who.transforms]
+        at_once = envs_at_once(len(chosen), cfg.env.num_envs)
+        device = device_of(cfg.device)
+        with closing(build_env(cfg.env, task, at_once, 0, device, transforms)) as several:
+            traced = record(
+                who.policy, several, chosen, who.critics, who.limit, policy=who.name, seed=cfg.seed
+            )
+        for transform in who.transforms:
+            transform.reset_parent()
+    if traced is not None and cfg.trace != "none":
+        log.info("Trace: %s", traced.save(out))
+    if cfg.why:
+        crashes = explain(traced, task) if traced is not None else []
+        if crashes:
+            with (out / "crashes.csv").open("w", newline="") as file:
+                writer = csv.DictWriter(file, list(crashes[0]), lineterminator="\n")
+                writer.writeheader()
+                writer.writerows(crashes)
+        log.info("\n%s", crash_table(crashes, len(rows)))
 
 
 def compiling(cfg: DictConfig, on: bool) -> DictConfig:
@@ -113,20 +181,6 @@ def compiling(cfg: DictConfig, on: bool) -> DictConfig:
         if key in cfg[part]:
             cfg[part][key] = on
     return cfg
-
-
-def trained_agent(cfg: DictConfig, path: Path) -> Agent:
-    """The agent of a run or checkpoint, its projector as far as the training had come.
-
-    Args:
-        cfg: the run's configuration.
-        path: the run or checkpoint.
-    """
-    agent = load_agent(cfg, path, "checkpoint")
-    if agent.projector is not None and hasattr(agent.projector, "set_progress"):
-        spent = Budget(cfg.episodes, cfg.frames).spent(**progress(path))
-        agent.projector.set_progress(spent)
-    return agent
 
 
 def on_its_own_task(cfg: DictConfig, trained: DictConfig, overrides: Sequence[str]) -> DictConfig:
@@ -167,31 +221,10 @@ def on_its_own_task(cfg: DictConfig, trained: DictConfig, overrides: Sequence[st
     return test
 
 
-@dataclass(frozen=True)
-class Candidate:
-    """Who is tested.
-
-    Attributes:
-        name: what to call it.
-        policy: acts.
-        transforms: what it drives with.
-        critics: Q_c(s, a) that it has learned, if it has, and their ``limit``.
-        about: what else is known of its training.
-    """
-
-    name: str
-    policy: TensorDictModuleBase
-    transforms: Sequence[Transform] = ()
-    critics: TensorDictModuleBase | None = None
-    limit: float | None = None
-    about: Mapping[str, Any] = field(default_factory=dict)
-
-
 def choose_policy(
     cfg: DictConfig,
-) -> tuple[DictConfig, Task, TensorDictModuleBase, list[Transform], str, dict[str, Any]]:
-    """A test's own configuration and task, the policy that it names, the transforms that this drives with,
-    what to call it, and what is known of its training.
+) -> tuple[DictConfig, Task, Candidate]:
+    """A test's own configuration and task, and who is tested.
 
     Raises:
         ValueError: not exactly one source, an unknown name, or a policy for other observations.
@@ -210,7 +243,7 @@ def choose_policy(
     if source == "policy":
         cfg = on_its_own_task(cfg, cfg, overrides)
         task = hydra.utils.instantiate(cfg.task)
-        return cfg, task, task.driver(name, cfg.seed), [], name, {}
+        return cfg, task, Candidate(name, task.driver(name, cfg.seed))
     path = pretrained_run(name) if source == "pretrained" else Path(name)
     trained = run_config(path, source)
     trained.device = cfg.device
@@ -223,49 +256,44 @@ def choose_policy(
                 f"task.{key} must be {value}, the number that this policy's network was trained with, "
                 f"got {task.network[key]}."
             )
-    policy, transforms = trained_policy(compiling(trained, cfg.compile), path)
-    if not cfg.project:
-        transforms = []
     called = f"{trained.algo_name} ({name})"
-    return cfg, task, policy, transforms, called, {"cost_limit": trained.cost_limit}
+    who = Candidate.trained(called, compiling(trained, cfg.compile), path, cfg.project)
+    return cfg, task, who
 
 
 def measure(
     env: DictConfig,
     task: Task,
-    policy: TensorDictModuleBase,
-    transforms: Sequence[Transform],
+    who: Candidate,
     *,
     out: Path,
     num_envs: int,
     episodes: int,
     seed: int,
     device: str,
-    policy_name: str,
-    **about: Any,
 ) -> list[dict]:
-    """Play, write ``metrics.json`` (with what ``about`` says) and ``episodes.csv``, report the table; returns the rows."""
+    """Play, write ``metrics.json`` and ``episodes.csv``, report the table; returns the rows."""
     at_once = envs_at_once(episodes, num_envs)
-    with closing(build_env(env, task, at_once, seed, device_of(device), transforms)) as several:
-        rows = play_episodes(policy, several, episodes, seed)
+    with closing(build_env(env, task, at_once, seed, device_of(device), who.transforms)) as several:
+        rows = play_episodes(who.policy, several, episodes, seed)
     latencies: list[float] = []
-    for transform in transforms:  # free for another environment
+    for transform in who.transforms:  # free for another environment
         transform.reset_parent()
         latencies += getattr(transform, "latencies", [])
     backend = env._target_.rpartition(".")[2]
     figures = write(
         rows,
         out,
-        policy=policy_name,
+        policy=who.name,
         env=backend,
         **task.describe(),
-        project=bool(transforms),
+        project=bool(who.transforms),
         episodes=episodes,
         seed=seed,
-        **about,
+        **who.about,
     )
-    title = f"{policy_name}: {episodes} episodes of {task.title}"
-    log.info("\n%s", table(figures, title, about.get("cost_limit")))
+    title = f"{who.name}: {episodes} episodes of {task.title}"
+    log.info("\n%s", table(figures, title, who.about.get("cost_limit")))
     if latencies:  # in a file of its own: the others are the same each time
         took = {"median": statistics.median(latencies), "longest": max(latencies)}
         timing = {name: round(1e3 * seconds, 3) for name, seconds in took.items()}

@@ -11,13 +11,11 @@ from typing import Any
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from tensordict.nn import TensorDictModuleBase
-from torchrl.envs.transforms import Transform
 
 from saferl.algorithms.assemble import build_trainer, complete
 from saferl.checkpoint.lock import alone
 from saferl.checkpoint.run import CONFIG, begun, run_config, run_folder
-from saferl.cli.evaluate import compiling, drawn, measure, pictures, trained_policy
+from saferl.cli.evaluate import Candidate, compiling, drawn, measure, pictures
 from saferl.cli.launch import job_folder
 from saferl.config.limits import check_limits
 from saferl.evaluation.compare import TESTED, side_by_side
@@ -82,28 +80,21 @@ def closing_test(cfg: DictConfig, run: Path) -> None:
     """Test what a run has learned, beside the scripted drivers that it names, and draw episodes of it."""
     settings = cfg.evaluation
     task = hydra.utils.instantiate(cfg.task).as_test()
-    policy, transforms = trained_policy(cfg, run)
-
-    def test(policy: TensorDictModuleBase, transforms: Sequence[Transform], name: str, out: Path):
-        return measure(
+    mine = Candidate.trained(cfg.algo_name, cfg, run)
+    drivers = [Candidate(name, task.driver(name, cfg.seed)) for name in settings.drivers]
+    out, results = run / "evaluation", {}
+    for who in (mine, *drivers):
+        results[who.name] = measure(
             cfg.env,
             task,
-            policy,
-            transforms,
-            out=out,
+            who,
+            out=out if who is mine else out / who.name,
             num_envs=settings.num_envs,
             episodes=settings.episodes,
             seed=cfg.seed,
             device=cfg.device,
-            policy_name=name,
-            cost_limit=cfg.cost_limit,
         )
-
-    out = run / "evaluation"
-    results = {cfg.algo_name: test(policy, transforms, cfg.algo_name, out)}
-    for name in settings.drivers:
-        results[name] = test(task.driver(name, cfg.seed), [], name, out / name)
-    if settings.drivers:
+    if drivers:
         title = f"The same {settings.episodes} episodes of {task.task}"
         runs = [
             (
@@ -114,17 +105,7 @@ def closing_test(cfg: DictConfig, run: Path) -> None:
         ]
         log.info("\n%s\n%s", title, side_by_side(runs, tuple(FIGURES)))
     chosen = drawn(results[cfg.algo_name], settings)
-    pictures(
-        cfg.env,
-        task,
-        policy,
-        transforms,
-        chosen,
-        out,
-        cfg.device,
-        cfg.algo_name,
-        settings.draw_format,
-    )
+    pictures(cfg.env, task, mine, chosen, out, cfg.device, settings.draw_format)
 
 
 #: Settings of where and how a run is made, not of what it is.

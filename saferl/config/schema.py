@@ -17,6 +17,7 @@ ORDERS = ("joint", "sequential")
 DEVICES = ("auto", "cpu", "cuda")
 DRAWN = ("none", "all", "collisions", "frozen", "success")
 FORMATS = ("gif", "mp4", "png")
+TRACED = ("none", "collisions", "all")
 
 
 def at_least(least: float, settings: Any, *names: str, prefix: str = "") -> None:
@@ -278,11 +279,14 @@ class Test:
     episode: Any = MISSING
     draw_most: int = MISSING
     draw_format: str = MISSING
+    trace: str = MISSING
+    why: bool = MISSING
 
     def __post_init__(self):
         at_least(1, self, "episodes", "threads")
         seeded(self)
         one_of(DEVICES, self, "device")
+        one_of(TRACED, self, "trace")
         drawing(self)
         if self.episode is None:
             return

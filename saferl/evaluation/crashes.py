@@ -15,6 +15,7 @@ from torch import Tensor
 from saferl.envs.intersection import BatchedIntersection, Scenario
 from saferl.envs.intersection.drivers import CautiousDriver, Driver
 from saferl.envs.intersection.dynamics import ACTION_SCALE
+from saferl.envs.intersection.episode import WORDS
 from saferl.evaluation.play import play
 from saferl.evaluation.trace import Trace
 
@@ -25,13 +26,6 @@ BEFORE, AFTER = 5.0, 5.0
 _AT_ONCE = 630  # episodes
 _FROM = ("from behind", "from the left", "oncoming", "from the right")
 _WAY = ("turning left", "straight on", "straight on", "turning right")
-#: The ego's routes in words.
-TASKS = {
-    "lt": "left turn",
-    "gs_inner": "straight on",
-    "gs_outer": "straight on",
-    "rt": "right turn",
-}
 
 
 def way(route: int) -> str:
@@ -113,12 +107,12 @@ def explain(trace: Trace, scenario: Scenario) -> list[dict[str, Any]]:
         row = {
             "episode": int(trace.episodes["episode"][index]),
             "seed": int(trace.episodes["seed"][index]),
-            "task": TASKS[str(trace.episodes["route"][index])],
+            "task": WORDS[str(trace.episodes["route"][index])],
             "what": way(int(rows["vehicle_route"][last, car])) if hit else "off the road",
             "car": car if hit else None,
             "time": round(last * dt, 3),
-            "speed": float(np.hypot(ego[2], ego[3])),
-            "car_speed": float(rows["vehicles"][last, car, 2]) if hit else None,
+            "speed": round(float(np.hypot(ego[2], ego[3])), 3),
+            "car_speed": round(float(rows["vehicles"][last, car, 2]), 3) if hit else None,
             "priority": ("car" if rows["priority"][last, car] else "ego") if hit else None,
             "warning": None,
             "corrected": None,
@@ -128,7 +122,8 @@ def explain(trace: Trace, scenario: Scenario) -> list[dict[str, Any]]:
             above = np.flatnonzero(rows["risk"][begin:last] > limit)
             if len(above):
                 row["warning"] = round((last - begin - above[0]) * dt, 3)
-                row["corrected"] = float(rows["intervened"][begin + above[0] : last].mean())
+                corrected = rows["intervened"][begin + above[0] : last].mean()
+                row["corrected"] = round(float(corrected), 3)
         found.append(row)
         actions.append(rows["executed"][:last] / np.array(ACTION_SCALE, dtype=np.float32))
     for row, saved in zip(found, _saved(scenario, found, actions, dt), strict=True):
@@ -186,7 +181,7 @@ def table(crashes: Sequence[Mapping[str, Any]], episodes: int) -> str:
         groups.setdefault((row["task"], row["what"]), []).append(row)
     lines = [
         f"{len(crashes)} crashes in {episodes} episodes; seconds before the crash are medians",
-        f"{'ego':<12} {'met':<30} {'crashes':>7} {'ego first':>9} {'warned':>13} {'braking helps':>14} {'cautious helps':>14}",
+        f"{'ego':<30} {'met':<30} {'crashes':>7} {'ego first':>9} {'warned':>13} {'braking helps':>14} {'cautious helps':>14}",
     ]
 
     def median(rows: Sequence[Mapping[str, Any]], key: str) -> str:
@@ -200,7 +195,7 @@ def table(crashes: Sequence[Mapping[str, Any]], episodes: int) -> str:
     ]:
         first = sum(row["priority"] == "ego" for row in rows)
         lines.append(
-            f"{task:<12} {what:<30} {len(rows):>7} {first:>9} {median(rows, 'warning'):>13} "
+            f"{task:<30} {what:<30} {len(rows):>7} {first:>9} {median(rows, 'warning'):>13} "
             f"{median(rows, 'braking'):>14} {median(rows, 'cautious'):>14}"
         )
     return "\n".join(lines)

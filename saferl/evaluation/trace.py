@@ -72,7 +72,7 @@ class Trace:
         """Write ``trace.npz`` into a folder: ``about`` as JSON, the arrays by name."""
         path = folder / TRACE
         folder.mkdir(parents=True, exist_ok=True)
-        arrays = {f"episode_{k}": v for k, v in self.episodes.items()} | dict(self.rows)
+        arrays: Any = {f"episode_{k}": v for k, v in self.episodes.items()} | dict(self.rows)
         np.savez_compressed(path, about=np.array(json.dumps(dict(self.about))), **arrays)
         return path
 
@@ -126,7 +126,7 @@ def record(
     """
     width = env.batch_size[0]
     task = cast(Scenario, env.task)
-    parts: list[TensorDictBase] = []
+    parts: list[Any] = []
     counts: list[int] = []
     for begin in range(0, len(rows), width):
         wanted = [row["seed"] for row in rows[begin : begin + width]]
@@ -134,9 +134,9 @@ def record(
         steps = [_kept(step) for step in play(policy, env, seeds)]
         alive = torch.stack([step["alive"] for step in steps])[:, : len(wanted)]
         counts += alive.sum(0).tolist()
-        flat = torch.stack(steps)[:, : len(wanted)].transpose(0, 1)[alive.T]  # pyright: ignore
-        parts.append(flat.cpu())
-    data = cast(TensorDictBase, torch.cat(parts))  # pyright: ignore[reportArgumentType]
+        whole: Any = torch.stack(steps)  # pyright: ignore[reportArgumentType]
+        parts.append(whole[:, : len(wanted)].transpose(0, 1)[alive.T].cpu())
+    data: Any = torch.cat(parts)
     count = torch.tensor(counts)
     first = torch.cat([torch.zeros(1, dtype=torch.int64), (count + 1).cumsum(0)])
     # Where the decisions go, and the states after the last ones.
@@ -148,7 +148,11 @@ def record(
         whole = value.new_empty((len(scene), *value.shape[1:]))
         whole[place], whole[first[1:] - 1] = value, data["next", "scene", key][ends]
         scene[key] = whole
-    found = {"ego": scene["ego"], "vehicles": scene["vehicles"], "priority": scene["priority"]}
+    found: dict[str, Tensor] = {
+        "ego": scene["ego"],
+        "vehicles": scene["vehicles"],
+        "priority": scene["priority"],
+    }
     found |= {"vehicle_route": scene["route"].to(torch.int8)} | _nearest(scene)
     for key, value in _decisions(policy, task, data, critics).items():
         missing = False if value.dtype == torch.bool else torch.nan
@@ -164,7 +168,8 @@ def record(
     }
     about |= {"dt": 1.0 / task.policy_frequency, "task": task.task, "scenario": task.scenario}
     about |= {"risk_limit": limit if critics is not None else None}
-    return Trace(about, episodes, {key: value.numpy() for key, value in found.items()})
+    arrays = {key: value.numpy() for key, value in found.items()}
+    return Trace(about, episodes, arrays)
 
 
 def outcome(row: Mapping[str, Any]) -> str:
@@ -173,17 +178,17 @@ def outcome(row: Mapping[str, Any]) -> str:
 
 
 def _kept(step: TensorDictBase) -> TensorDictBase:
-    told = step["next"].select(*_TOLD, strict=False)
-    return step.select(*_READ, "alive").set("next", told)
+    kept: Any = step.select(*_READ, "alive")
+    return kept.set("next", step.get("next").select(*_TOLD, strict=False))
 
 
 def _nearest(scene: TensorDictBase) -> dict[str, Tensor]:
     ego, others = scene["ego"], scene["vehicles"].movedim(-2, 0)
-    bodies = [frame(s[..., 0], s[..., 1], s[..., 4]) for s in (ego, others)]
+    body, bodies = (frame(s[..., 0], s[..., 1], s[..., 4]) for s in (ego, others))
     if not len(others):
         gap = torch.full((len(ego),), torch.nan)
         return {"gap": gap, "nearest": torch.full_like(gap, -1, dtype=torch.int16)}
-    gaps = separation(*bodies).nan_to_num(torch.inf)
+    gaps = separation(body, bodies).nan_to_num(torch.inf)
     gap, nearest = gaps.min(0)
     there = gap.isfinite()
     return {
@@ -195,7 +200,7 @@ def _nearest(scene: TensorDictBase) -> dict[str, Tensor]:
 def _decisions(
     policy: TensorDictModuleBase,
     task: Scenario,
-    data: TensorDictBase,
+    data: Any,
     critics: TensorDictModuleBase | None,
 ) -> dict[str, Tensor]:
     """What belongs to decisions [D, ...]."""

@@ -18,8 +18,9 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 
 from saferl.algorithms.assemble import build_trainer
+from saferl.algorithms.policy import trained_agent
 from saferl.checkpoint.run import CONFIG, export
-from saferl.cli.evaluate import on_its_own_task, trained_policy
+from saferl.cli.evaluate import on_its_own_task
 from saferl.envs.intersection import (
     BatchedIntersection,
     CollisionCost,
@@ -307,12 +308,12 @@ def test_a_checkpoints_projector_acts_as_it_did_in_training(tmp_path: Path):
     trainer.save()
     OmegaConf.save(cfg, tmp_path / "run" / CONFIG, resolve=True)
     early = export(tmp_path / "run", tmp_path / "early")
-    assert [bool(t.enabled) for t in trained_policy(cfg, early)[1]] == [False]
-    assert [bool(t.enabled) for t in trained_policy(cfg, tmp_path / "run")[1]] == [False]
+    assert [bool(t.enabled) for t in trained_agent(cfg, early).transforms] == [False]
+    assert [bool(t.enabled) for t in trained_agent(cfg, tmp_path / "run").transforms] == [False]
     trainer.train()
     late = export(tmp_path / "run", tmp_path / "late")
-    assert [bool(t.enabled) for t in trained_policy(cfg, late)[1]] == [True]
-    assert [bool(t.enabled) for t in trained_policy(cfg, tmp_path / "run")[1]] == [True]
+    assert [bool(t.enabled) for t in trained_agent(cfg, late).transforms] == [True]
+    assert [bool(t.enabled) for t in trained_agent(cfg, tmp_path / "run").transforms] == [True]
 
 
 def test_tests_do_not_mix(tmp_path: Path, command, refusal):

@@ -1,0 +1,111 @@
+"""A trained policy as one module, with its projector inside."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from saferl.algorithms.assemble import load_agent
+from saferl.algorithms.base import Agent
+from saferl.checkpoint.run import progress, run_config
+from saferl.config.locate import pretrained_run
+from saferl.envs.transforms import SafetyProjector
+from saferl.training.progress import Budget
+
+
+class SafePolicy(TensorDictModuleBase):
+    """The mean action of a policy, corrected wherever its risk exceeds a limit: what ships.
+
+    In an environment :class:`~saferl.envs.transforms.SafetyProjector` does the same as a transform; this needs none.
+
+    Args:
+        actor: reads the observation and writes ``action`` [*B, A].
+        projector: of its actions; None: they are executed as they are.
+        low, high: of the actions.
+
+    Reads what ``actor`` and the projector's risk read. Writes ``action`` [*B, A], what is to be executed; with a projector
+    also ``action_proposed`` [*B, A], ``risk_before``, ``risk_after`` [*B, 1], ``intervened`` [*B, 1] (bool) and what else
+    :class:`~saferl.envs.transforms.SafetyProjector` tells.
+
+    >>> import torch
+    >>> from tensordict import TensorDict
+    >>> from tensordict.nn import TensorDictModule
+    >>> actor = TensorDictModule(lambda x: x, ["x"], ["action"])
+    >>> risk = TensorDictModule(lambda x, action: action, ["x", "action"], ["risk"])
+    >>> policy = SafePolicy(actor, SafetyProjector(risk, limit=0.5))
+    >>> out = policy(TensorDict({"x": torch.tensor([[0.2], [0.9]])}, [2]))
+    >>> bool((out["action"] <= 0.5).all()), out["intervened"].flatten().tolist()
+    (True, [False, True])
+    """
+
+    def __init__(
+        self,
+        actor: TensorDictModuleBase,
+        projector: SafetyProjector | None = None,
+        low: float = -1.0,
+        high: float = 1.0,
+    ):
+        super().__init__()
+        self.in_keys: list = list(actor.in_keys)
+        self.out_keys: list = ["action"]
+        self.actor, self.projector, self.box = actor, projector, {"low": low, "high": high}
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            seen = self.actor(tensordict.select(*self.in_keys))
+        action = seen["action"]
+        if self.projector is None:
+            return tensordict.set("action", action)
+        report = self.projector.correct(seen, **self.box)
+        tensordict.update(report.exclude("action_executed"))
+        tensordict.set("action_proposed", action)
+        return tensordict.set("action", report["action_executed"])
+
+
+def trained_agent(cfg: DictConfig, path: Path) -> Agent:
+    """The agent of a run or checkpoint, its projector as far as the training had come.
+
+    Args:
+        cfg: the run's configuration.
+        path: the run or checkpoint.
+
+    Raises:
+        FileNotFoundError: there is no checkpoint.
+        ValueError: it does not fit the configuration.
+    """
+    agent = load_agent(cfg, path, "checkpoint")
+    if agent.projector is not None and hasattr(agent.projector, "set_progress"):
+        spent = Budget(cfg.episodes, cfg.frames).spent(**progress(path))
+        agent.projector.set_progress(spent)
+    return agent
+
+
+def load_policy(source: str | Path, device: str = "cpu", project: bool = True) -> SafePolicy:
+    """A policy that ships with saferl, or one of your own, ready to drive.
+
+    Args:
+        source: the name of a policy that ships with saferl (``arsac``), or the path of a run, a checkpoint, or an exported
+            ``policy.safetensors``.
+        device: of the networks.
+        project: whether the projector corrects its actions, if it was trained with one.
+
+    Raises:
+        ValueError: there is no policy of this name or at this path, or its file is damaged.
+        FileNotFoundError: the run has no checkpoint.
+    """
+    path = Path(source)
+    path = path if path.exists() else pretrained_run(str(source))
+    cfg = run_config(path)
+    cfg.device = device
+    if "compile" in cfg.projector:
+        cfg.projector.compile = (
+            False  # which takes minutes and is worth it for millions of decisions
+        )
+    agent = trained_agent(cfg, path)
+    return SafePolicy(agent.actor, agent.projector if project else None)
