@@ -19,6 +19,7 @@ from saferl.checkpoint.lock import alone
 from saferl.checkpoint.run import CONFIG, begun, run_config, run_folder
 from saferl.cli.evaluate import compiling, measure, pictures, trained_policy
 from saferl.cli.launch import job_folder
+from saferl.config.flat import MADE
 from saferl.config.limits import check_limits
 from saferl.evaluation.compare import TESTED, side_by_side
 from saferl.evaluation.statistics import FIGURES, summarise
@@ -116,10 +117,6 @@ def closing_test(cfg: DictConfig, run: Path) -> None:
     pictures(
         cfg.env, task, policy, transforms, results[cfg.algo_name][: settings.gif], out, cfg.device
     )
-
-
-#: Settings of where and how a run is made, not of what it is.
-MADE = ("out", "device", "threads", "logger", "save_every", "save_minutes")
 
 
 def composed(cfg: DictConfig) -> Any:
