@@ -27,7 +27,7 @@ def main(arguments: list[str] | None = None) -> None:
 
     try:
         report = build(given.folders, given.out, given.against)
-    except ValueError as error:
+        path = write(report, given.out)
+    except (ValueError, OSError) as error:
         raise SystemExit(f"error: {error}") from None
-    path = write(report, given.out)
     print(f"Runs: {states(report.runs)}.\nClaims: {verdicts(report.claims)}.\n{path}")

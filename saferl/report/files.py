@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from saferl.report.build import Report
 from saferl.report.figure import draw
 from saferl.report.resampling import RESAMPLES
 from saferl.report.text import (
+    Grid,
     effort_grid,
     effort_rows,
     latex,
@@ -15,33 +17,28 @@ from saferl.report.text import (
     run_grid,
     sentence,
     states,
-    strong,
     table_grid,
     table_rows,
-    textbf,
     verdicts,
     write_csv,
 )
 
 
 def write(report: Report, out: Path) -> Path:
-    """Write ``report.md``, its tables as Markdown, LaTeX and CSV, and ``curves.png`` and ``curves.pdf``; returns ``report.md``."""
-    out.mkdir(parents=True, exist_ok=True)
+    """Write ``report.md``, its tables as Markdown, LaTeX and CSV, and ``curves.png`` and ``curves.pdf``; returns ``report.md``.
+
+    Args:
+        report: what :func:`build` returned.
+        out: folder, which is there.
+    """
     parts = ["# Report", f"Runs: {states(report.runs)}.", _READING]
     for table in report.tables:
-        text = markdown(table_grid(table, strong))
-        parts += [f"## {table.title}", text]
-        (out / f"{table.name}.md").write_text(f"{text}\n", encoding="utf-8")
-        tex = latex(table_grid(table, textbf), f"{table.title}.", f"t_{table.name}")
-        (out / f"{table.name}.tex").write_text(tex, encoding="utf-8")
-        write_csv(table_rows(table), out / f"{table.name}.csv")
+        parts.append(f"## {table.title}")
+        parts.append(_save(table.name, table.title, table_grid(table), table_rows(table), out))
     if report.efforts:
-        grid = effort_grid(report.efforts, report.against)
-        parts += ["## What each system took", _EFFORT, markdown(grid)]
-        (out / "systems.md").write_text(f"{markdown(grid)}\n", encoding="utf-8")
-        tex = latex(grid, "What each system took.", "t_systems")
-        (out / "systems.tex").write_text(tex, encoding="utf-8")
-        write_csv(effort_rows(report.efforts), out / "systems.csv")
+        title, grid = "What each system took", effort_grid(report.efforts, report.against)
+        parts += [f"## {title}", _EFFORT]
+        parts.append(_save("systems", title, grid, effort_rows(report.efforts), out))
     parts += ["## The paper's claims", f"{_CLAIMS} {verdicts(report.claims)}."]
     parts.append("\n".join(f"- {sentence(claim)}" for claim in report.claims))
     if report.curves:
@@ -52,6 +49,15 @@ def write(report: Report, out: Path) -> Path:
     path = out / "report.md"
     path.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
     return path
+
+
+def _save(name: str, title: str, grid: Grid, rows: Sequence[dict], out: Path) -> str:
+    """Write a table in its three forms; returns the Markdown."""
+    text = markdown(grid)
+    (out / f"{name}.md").write_text(f"{text}\n", encoding="utf-8")
+    (out / f"{name}.tex").write_text(latex(grid, f"{title}.", f"t_{name}"), encoding="utf-8")
+    write_csv(rows, out / f"{name}.csv")
+    return text
 
 
 _READING = f"""\

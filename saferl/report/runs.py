@@ -81,12 +81,14 @@ def find(folders: Sequence[Path]) -> list[Run]:
             raise ValueError(f"no such folder: {folder}")
     marks = (CONFIG, FAILED, CURVE, TESTED)
     found = {
-        path.parents[mark.count("/")]: None
+        (run := path.parents[mark.count("/")]).resolve(): run
         for folder in folders
         for mark in marks
         for path in folder.glob(f"**/{mark}")
     }
-    runs = [look(folder) for folder in sorted(found, key=lambda path: (len(str(path)), path))]
+    runs = [
+        look(folder) for folder in sorted(found.values(), key=lambda path: (len(str(path)), path))
+    ]
     return sorted(_strangers(runs), key=lambda run: run.algo)
 
 

@@ -17,6 +17,8 @@ TITLES = {
 }
 #: What is better: less or more of a figure. Speed has no better: who drives through others is fast.
 BETTER = {"collision_rate": min, "success_rate": max, "frozen_rate": min, "return": max}
+#: By which seeds of two systems are compared.
+COMPARED = ("collision_rate", "success_rate")
 #: Not in the paper's table, but of the same question.
 _ABLATED = ("arsac_unprojected",)
 
@@ -140,7 +142,6 @@ class Effort:
 def efforts(systems: Sequence[System], against: str) -> list[Effort]:
     """One row for each trained system; ``against`` is the one that they are compared with."""
     other = next((system for system in systems if system.name == against), None)
-    compared = ("collision_rate", "success_rate")
     return [
         Effort(
             system.name,
@@ -149,10 +150,10 @@ def efforts(systems: Sequence[System], against: str) -> list[Effort]:
             system.frames,
             system.updates,
             system.minutes,
-            {figure: system.interquartile_mean(figure) for figure in compared},
+            {figure: system.interquartile_mean(figure) for figure in COMPARED},
             {
                 figure: system.improvement(other, figure, BETTER[figure] is min)
-                for figure in compared
+                for figure in COMPARED
                 if other is not None and other is not system
             },
         )

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from saferl.evaluation.statistics import span
 from saferl.report.claims import VERDICTS, Claim
 from saferl.report.runs import FIGURES, STATES, Run
 from saferl.report.systems import LABELS, Cell
-from saferl.report.tables import Effort, Row, Table
+from saferl.report.tables import COMPARED, Effort, Row, Table
 
 #: Heading, scale and digits of each figure.
 COLUMNS = {
@@ -28,18 +30,14 @@ _NONE = "-"
 def number(value: float | None, digits: int = 1, scale: float = 1.0) -> str:
     """A number, "-" for none.
 
-    >>> number(0.025, 1, 100), number(None), number(1234567.0, 0)
-    ('2.5', '-', '1,234,567')
+    >>> number(0.025, 1, 100), number(-0.01), number(None), number(1234567.0, 0)
+    ('2.5', '0.0', '-', '1,234,567')
     """
-    if value is None or value != value:
-        return _NONE
-    text = f"{value * scale:,.{digits}f}"
-    return text.lstrip("-") if float(text.replace(",", "")) == 0 else text
+    return _NONE if value is None or value != value else f"{value * scale:{_form(digits)}}"
 
 
-def span(low: float | None, high: float | None, digits: int = 1, scale: float = 1.0) -> str:
-    """An interval in brackets."""
-    return f"[{number(low, digits, scale)}, {number(high, digits, scale)}]"
+def _form(digits: int) -> str:
+    return f"z,.{digits}f"  # without the sign of a zero
 
 
 def cell(value: Cell | None, figure: str) -> str:
@@ -52,25 +50,24 @@ def cell(value: Cell | None, figure: str) -> str:
         return _NONE
     _, scale, digits = COLUMNS[figure]
     std = "" if value.std is None else f" ± {number(value.std, digits, scale)}"
-    interval = span(value.low, value.high, digits, scale)
+    interval = span(value.low, value.high, _form(digits), scale)
     return f"{number(value.mean, digits, scale)}{std} {interval}"
 
 
-Bold = Callable[[str], str]
 Grid = list[list[str]]
 
 
-def table_grid(table: Table, bold: Bold) -> Grid:
-    """A table of the paper: its heading and its rows, text by text."""
+def table_grid(table: Table) -> Grid:
+    """A table of the paper: its heading and its rows, text by text, what is best between asterisks."""
     heads = [text for figure in FIGURES for text in (COLUMNS[figure][0], "paper")]
-    return [["task", "system", "seeds", *heads], *(_row(row, bold) for row in table.rows)]
+    return [["task", "system", "seeds", *heads], *map(_row, table.rows)]
 
 
-def _row(row: Row, bold: Bold) -> list[str]:
+def _row(row: Row) -> list[str]:
     texts = [row.condition.upper(), row.label, str(row.seeds)]
     for figure in FIGURES:
         text = cell(row.cells[figure], figure)
-        texts.append(bold(text) if figure in row.best else text)
+        texts.append(f"**{text}**" if figure in row.best else text)
         texts.append(row.paper[figure] or _NONE)
     return texts
 
@@ -79,18 +76,16 @@ def effort_grid(efforts: Sequence[Effort], against: str) -> Grid:
     """What each system took and how it stands to another."""
     other = LABELS.get(against, against)
     heads = ["system", "seeds", "frames", "updates", "minutes"]
-    heads += [f"{COLUMNS[figure][0]}, middle half" for figure in ("collision_rate", "success_rate")]
+    heads += [f"{COLUMNS[figure][0]}, middle half" for figure in COMPARED]
     heads += [f"P(CR below {other}'s)", f"P(SR above {other}'s)"]
     rows = [heads]
     for each in efforts:
         texts = [each.label, str(each.seeds), number(each.frames, 0), number(each.updates, 0)]
         texts.append(number(each.minutes))
-        texts += [
-            number(each.interquartile[f], 1, 100.0) for f in ("collision_rate", "success_rate")
-        ]
-        for figure in ("collision_rate", "success_rate"):
+        texts += [number(each.interquartile[f], 1, 100.0) for f in COMPARED]
+        for figure in COMPARED:
             value = each.improvement.get(figure)
-            texts.append(f"{number(value[0], 2)} {span(*value[1:], 2)}" if value else _NONE)
+            texts.append(f"{number(value[0], 2)} {span(*value[1:], _form(2))}" if value else _NONE)
         rows.append(texts)
     return rows
 
@@ -111,7 +106,11 @@ _ESCAPED = {"±": r"$\pm$", "%": r"\%", "_": r"\_", "&": r"\&", "#": r"\#"}
 
 
 def latex(grid: Grid, caption: str, label: str) -> str:
-    """A table* for booktabs and graphicx; where the first column changes, a rule."""
+    r"""A table* for booktabs and graphicx; where the first column changes, a rule.
+
+    >>> latex([["task", "CR (%)"], ["LT", "**1 ± 2**"]], "A", "t").splitlines()[9:11]
+    ['\\midrule', 'LT & \\textbf{1 $\\pm$ 2} \\\\']
+    """
     heads, *rows = [[_escaped(text) for text in row] for row in grid]
     body = []
     for index, row in enumerate(rows):
@@ -139,17 +138,8 @@ def latex(grid: Grid, caption: str, label: str) -> str:
 
 
 def _escaped(text: str) -> str:
-    return "".join(_ESCAPED.get(letter, letter) for letter in text)
-
-
-def strong(text: str) -> str:
-    """Bold in Markdown."""
-    return f"**{text}**"
-
-
-def textbf(text: str) -> str:
-    """Bold in LaTeX."""
-    return rf"\textbf{{{text}}}"
+    text = "".join(_ESCAPED.get(letter, letter) for letter in text)
+    return re.sub(r"\*\*(.+?)\*\*", r"\\textbf{\1}", text)
 
 
 def write_csv(rows: Sequence[dict[str, Any]], path: Path) -> None:
@@ -209,7 +199,7 @@ def sentence(claim: Claim) -> str:
         return (
             f"{told}. {apart}; of one seed there is no interval ({seeds[0]} and {seeds[1]} seeds)."
         )
-    interval = span(claim.low, claim.high, digits, scale)
+    interval = span(claim.low, claim.high, _form(digits), scale)
     return f"{told}. {apart} {interval} ({seeds[0]} and {seeds[1]} seeds)."
 
 

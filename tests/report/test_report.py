@@ -63,6 +63,7 @@ def test_the_table_by_hand(report):
 
     mean = rows(report[0], 0, "mean")["arsac"].cells["collision_rate"]
     assert mean.mean == pytest.approx((1 / 6 + 0 + 0) / 3)  # each task weighs the same
+    assert [system.name for system in report[0].systems if system.shaped] == ["sac_rs"]
     single = rows(report[0], 0, "mean")["sac_rs"].cells["collision_rate"]
     assert single.mean == pytest.approx((1 / 2 + 1 / 4) / 3) and single.std is None
 
@@ -203,7 +204,7 @@ def test_the_files(report):
 
 
 def test_each_row_of_a_table_has_each_column(report):
-    grid = table_grid(report[0].tables[0], lambda text: text)
+    grid = table_grid(report[0].tables[0])
     assert {len(row) for row in grid} == {13}
     lines = markdown(grid).splitlines()
     assert {line.count("|") for line in lines} == {14}
@@ -226,6 +227,7 @@ def test_the_command(report, capsys, monkeypatch):
         ([folder, "--against", "scripted"], "--against must be among cpo, "),
         ([f"{folder}/nowhere"], "no such folder"),
         ([str(out)], "no run below"),
+        ([folder, "--out", str(out / "report.md")], ".*File exists"),
     ):
         with pytest.raises(SystemExit, match=f"^error: {line}"):
             main(arguments)
