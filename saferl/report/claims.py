@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from saferl.report.systems import LABELS, System
 
@@ -82,13 +82,16 @@ def answers(systems: Sequence[System]) -> list[Claim]:
 
 
 def _answer(claim: Claim, there: Mapping[str, System]) -> Claim:
-    pair = [there.get(name) for name in (claim.system, claim.other)]
-    seeds = [len(system.seeds) if system else 0 for system in pair]
-    bounds: list[float | None] = [None, None, None]
-    if all(pair):
-        mine, other = [system.estimate("mean", claim.figure) for system in pair if system]
-        if mine is not None and other is not None:
-            apart = mine - other
-            bounds = [apart.value, *(apart.interval() if min(seeds) > 1 else (None, None))]
-    about = (claim.claim, claim.system, claim.other, claim.figure, claim.sign)
-    return Claim(*about, *seeds, *bounds)
+    mine, other = there.get(claim.system), there.get(claim.other)
+    claim = replace(
+        claim,
+        seeds=len(mine.seeds) if mine else 0,
+        other_seeds=len(other.seeds) if other else 0,
+    )
+    estimates = [each and each.estimate("mean", claim.figure) for each in (mine, other)]
+    if estimates[0] is None or estimates[1] is None:
+        return claim
+    apart = estimates[0] - estimates[1]
+    surely = min(claim.seeds, claim.other_seeds) > 1
+    low, high = apart.interval() if surely else (None, None)
+    return replace(claim, difference=apart.value, low=low, high=high)

@@ -184,14 +184,14 @@ def sentence(claim: Claim) -> str:
     >>> sentence(Claim(*about, 5, 4, -0.05, -0.07, -0.03))
     'ARSAC has fewer collisions than SAC: **confirmed**. CR differs by -5.0 points [-7.0, -3.0] (5 and 4 seeds).'
     >>> sentence(Claim(*about, 5, 0))
-    'ARSAC has fewer collisions than SAC: **no data** (no run of SAC).'
+    'ARSAC has fewer collisions than SAC: **no data** (no run of SAC counts).'
     """
     labels = [LABELS[name] for name in (claim.system, claim.other)]
     seeds = (claim.seeds, claim.other_seeds)
     told = f"{claim.claim}: **{claim.verdict}**"
     if claim.difference is None:
         missing = [label for label, count in zip(labels, seeds, strict=True) if not count]
-        return f"{told} (no run of {' nor of '.join(missing)})."
+        return f"{told} (no run of {' nor of '.join(missing)} counts)."
     heading, scale, digits = COLUMNS[claim.figure]
     name, unit = heading.split(" ")[0], "points" if scale == 100 else "m/s"
     apart = f"{name} differs by {number(claim.difference, digits, scale)} {unit}"
