@@ -32,11 +32,8 @@ def alone(run: Path, option: str) -> Iterator[None]:
     try:
         lock.acquire(timeout=0)
     except Timeout:
-        who = "another process"
-        with suppress(OSError):  # it may not have said so yet
-            who = holder.read_text(encoding="utf-8").strip() or who
         raise ValueError(
-            f"{option}: {who} works on {run}; wait until it ends, or stop it."
+            f"{option}: {_who(run)} works on {run}; wait until it ends, or stop it."
         ) from None
     try:
         holder.unlink(missing_ok=True)  # of a process that was killed
@@ -49,3 +46,24 @@ def alone(run: Path, option: str) -> Iterator[None]:
             if [path.name for path in run.iterdir()] == [_LOCK]:  # nothing began
                 (run / _LOCK).unlink()
         lock.release()
+
+
+def worker(run: Path) -> str | None:
+    """Who works on a run's folder: ``process 71 on desk since 2026-01-31 12:00:00``; None if nobody does.
+
+    Args:
+        run: the folder, which may be read-only.
+    """
+    if not (run / _HOLDER).exists():  # nobody is kept out for the moment that a look takes
+        return None
+    try:
+        with FileLock(run / _LOCK, timeout=0):
+            return None  # whoever held it was killed
+    except (Timeout, OSError):
+        return _who(run)
+
+
+def _who(run: Path) -> str:
+    with suppress(OSError):  # it may not have said so yet
+        return (run / _HOLDER).read_text(encoding="utf-8").strip() or "another process"
+    return "another process"

@@ -17,6 +17,7 @@ from saferl.checkpoint.lock import alone
 from saferl.checkpoint.run import CONFIG, begun, run_config, run_folder
 from saferl.cli.evaluate import Candidate, compiling, drawn, measure, pictures
 from saferl.cli.launch import job_folder
+from saferl.config.flat import MADE
 from saferl.config.limits import check_limits
 from saferl.evaluation.compare import TESTED, side_by_side
 from saferl.evaluation.statistics import FIGURES, summarise
@@ -106,10 +107,6 @@ def closing_test(cfg: DictConfig, run: Path) -> None:
         log.info("\n%s\n%s", title, side_by_side(runs, tuple(FIGURES)))
     chosen = drawn(results[cfg.algo_name], settings)
     pictures(cfg.env, task, mine, chosen, out, cfg.device, settings.draw_format)
-
-
-#: Settings of where and how a run is made, not of what it is.
-MADE = ("out", "device", "threads", "logger", "save_every", "save_minutes")
 
 
 def composed(cfg: DictConfig) -> Any:

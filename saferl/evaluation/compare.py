@@ -110,7 +110,7 @@ def cell(tests: Sequence[Mapping[str, Any]], name: str) -> str:
     >>> cell([{"episodes": 50, "success_rate": {"mean": 1.0}}] * 2, "success_rate")
     '100.0 [96.3, 100.0]'
     """
-    from saferl.evaluation.statistics import mean_interval, span, wilson, within
+    from saferl.evaluation.statistics import as_sure_as, mean_interval, span, within
 
     if not tests:
         return "-"
@@ -118,17 +118,13 @@ def cell(tests: Sequence[Mapping[str, Any]], name: str) -> str:
     mean = sum(means) / len(means)
     rate = name.endswith("_rate")
     if len(means) > 1:
-        low, high = within(name, mean_interval(means), means)
+        interval = within(name, mean_interval(means), means)
     else:
-        low, high = (tests[0][name][bound] for bound in ("low", "high"))
+        interval = tests[0][name]["low"], tests[0][name]["high"]
     if not rate:
-        return f"{mean:.4g} {span(low, high, '.4g')}"
-    if low is not None and high is not None:
-        # Seeds that agree do not make a rate surer than its episodes.
-        episodes = sum(test["episodes"] for test in tests)
-        least, most = wilson(round(mean * episodes), episodes)
-        low, high = min(low, least), max(high, most)
-    return f"{100 * mean:.1f} {span(low, high, '.1f', 100)}"
+        return f"{mean:.4g} {span(*interval, '.4g')}"
+    interval = as_sure_as(mean, sum(test["episodes"] for test in tests), interval)
+    return f"{100 * mean:.1f} {span(*interval, '.1f', 100)}"
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -8,6 +8,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -49,6 +50,28 @@ def episode_rows(steps: list[TensorDictBase], seeds: Tensor, task: Task) -> list
             total["correction"] /= max(interventions, 1.0)
         rows.append({"seed": seed, **own[index], **total, "decisions": count})
     return rows
+
+
+def read(path: Path) -> dict[str, np.ndarray]:
+    """The columns of a file of rows, ``episodes.csv`` or a run's curve: float [rows], NaN where a cell is empty; text where
+    a column holds other than numbers.
+
+    Raises:
+        ValueError: the file is damaged: it has no rows, or one that is too short or too long.
+    """
+    with path.open(newline="", encoding="utf-8") as file:
+        header, *rows = list(csv.reader(file)) or [[]]
+    if not rows or any(len(row) != len(header) for row in rows):
+        raise ValueError(
+            f"{path} is damaged: each row must have {len(header)} cells, at least one."
+        )
+    columns = {}
+    for name, cells in zip(header, zip(*rows, strict=True), strict=True):
+        try:
+            columns[name] = np.array([cell or "nan" for cell in cells], dtype=float)
+        except ValueError:
+            columns[name] = np.array(cells)
+    return columns
 
 
 def write(rows: list[dict], out: Path, /, **about: Any) -> dict:

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from saferl.evaluation.statistics import FIGURES
+from saferl.evaluation.statistics import FIGURES, WINDOW
 
 #: How episodes ended, [n] by name, from their last steps: :meth:`saferl.envs.task.Task.outcomes`.
 Outcomes = Callable[[TensorDictBase], Mapping[str, torch.Tensor]]
@@ -54,7 +54,7 @@ class EpisodeWindow:
     {}
     """
 
-    def __init__(self, outcomes: Outcomes = no_outcomes, length: int = 200):
+    def __init__(self, outcomes: Outcomes = no_outcomes, length: int = WINDOW):
         self.outcomes, self.length = outcomes, length
         self.values: dict[str, torch.Tensor] = {}
 

@@ -20,6 +20,7 @@ from saferl.algorithms.assemble import build_agent, build_trainer, load_agent
 from saferl.checkpoint.lock import alone
 from saferl.checkpoint.run import CONFIG, run_config
 from saferl.evaluation.compare import main as summarise
+from saferl.report.command import main as report
 
 TRAIN, TEST, EXPORT = ("train", "config"), ("evaluate", "evaluate"), ("export", "export")
 
@@ -248,7 +249,7 @@ def test_the_readmes_everyday_commands_work_in_order(command, tmp_path: Path):
     readme = (Path(__file__).parents[2] / "README.md").read_text()
     block = readme.partition("## Everyday commands")[2].split("```")[1]
     lines = [line.partition("#")[0].split() for line in block.splitlines() if "-m saferl" in line]
-    assert len(lines) == 12
+    assert len(lines) == 13
     small = {"saferl": (*SMALL, *EMPTY), "saferl.evaluate": (*EMPTY, "episodes=1", "draw=none")}
     for _, _, module, *arguments in lines:
         name = module.partition(".")[2] or "train"
@@ -257,11 +258,15 @@ def test_the_readmes_everyday_commands_work_in_order(command, tmp_path: Path):
         if name == "summary":
             summarise(arguments)
             continue
+        if name == "report":
+            report(arguments)
+            continue
         if not any(argument.startswith("resume=") for argument in arguments):
             arguments += small.get(module, ())
         elif len(arguments) > 1:
             arguments[1] = "frames=32"
         command(name, "config" if name == "train" else name, *arguments)
+    assert "sac" in (tmp_path / "report/systems.csv").read_text()
     assert (tmp_path / "test/metrics.json").is_file() and (tmp_path / "policy").is_dir()
 
 

@@ -1,0 +1,33 @@
+"""The command line of a report."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+from pathlib import Path
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Write the report of all runs below these folders."""
+    parser = argparse.ArgumentParser(
+        "python -m saferl.report",
+        description="The paper's tables, claims and learning curves from all runs below some folders, as report.md, "
+        "with tables in Markdown, LaTeX and CSV. Unfinished, damaged and foreign runs are listed with their reason.",
+    )
+    parser.add_argument("folders", nargs="+", type=Path, metavar="RUNS", help="runs lie below it")
+    parser.add_argument("--out", type=Path, default=Path("report"), help="folder (report)")
+    parser.add_argument(
+        "--against", default="arsac", help="the system that others are compared with (arsac)"
+    )
+    given = parser.parse_args(arguments)
+    logging.basicConfig(level=logging.INFO, format="%(message)s")  # says when a driver plays
+    from saferl.report.build import build  # late: help needs no torch
+    from saferl.report.files import write
+    from saferl.report.text import states, verdicts
+
+    try:
+        report = build(given.folders, given.out, given.against)
+        path = write(report, given.out)
+    except (ValueError, OSError) as error:
+        raise SystemExit(f"error: {error}") from None
+    print(f"Runs: {states(report.runs)}.\nClaims: {verdicts(report.claims)}.\n{path}")
