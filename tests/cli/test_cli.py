@@ -19,7 +19,6 @@ from small import EMPTY, SMALL, compose
 from saferl.algorithms.assemble import build_agent, build_trainer, load_agent
 from saferl.checkpoint.lock import alone
 from saferl.checkpoint.run import CONFIG, run_config
-from saferl.evaluation.compare import main as summarise
 
 TRAIN, TEST, EXPORT = ("train", "config"), ("evaluate", "evaluate"), ("export", "export")
 
@@ -237,28 +236,6 @@ def test_help_lists_groups_and_settings(command, capsys):
     text = capsys.readouterr().out
     assert "python -m saferl algo=arsac task=gs" in text and "gamma: 0.99" in text
     assert "algo: arppo, arsac, arsac_plus, arsac_signed, arsac_unprojected, asac, cpo" in text
-
-
-def test_the_readmes_everyday_commands_work_in_order(command, tmp_path: Path):
-    """With small budgets on an empty road, but otherwise as they stand there."""
-    readme = (Path(__file__).parents[2] / "README.md").read_text()
-    block = readme.partition("## Everyday commands")[2].split("```")[1]
-    lines = [line.partition("#")[0].split() for line in block.splitlines() if "-m saferl" in line]
-    assert len(lines) == 12
-    small = {"saferl": (*SMALL, *EMPTY), "saferl.evaluate": (*EMPTY, "episodes=1", "gif=0")}
-    for _, _, module, *arguments in lines:
-        name = module.partition(".")[2] or "train"
-        if "--help" in arguments:
-            continue
-        if name == "summary":
-            summarise(arguments)
-            continue
-        if not any(argument.startswith("resume=") for argument in arguments):
-            arguments += small.get(module, ())
-        elif len(arguments) > 1:
-            arguments[1] = "frames=32"
-        command(name, "config" if name == "train" else name, *arguments)
-    assert (tmp_path / "test/metrics.json").is_file() and (tmp_path / "policy").is_dir()
 
 
 def test_a_mistake_in_a_process_of_its_own(spawn, tmp_path: Path):
