@@ -48,7 +48,9 @@ def settings(root: DictConfig) -> str:
                 text = file.read_text(encoding="utf-8")
                 notes[group] = "", f"{choice}: {headline(text)}"
                 prefix = f"{part.package}." if part.package else ""
-                notes |= {f"{prefix}{name}": note for name, note in comments(text).items()}
+                for name, (above, behind) in comments(text).items():
+                    old = notes.get(f"{prefix}{name}", ("", ""))
+                    notes[f"{prefix}{name}"] = above or old[0], behind or old[1]
     own: Any = OmegaConf.to_container(root, resolve=False)
     del own["hydra"]
     width = shutil.get_terminal_size((120, 24)).columns

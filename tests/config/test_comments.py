@@ -102,6 +102,8 @@ def test_comments_stand_where_they_belong(help_of):
     ):
         assert re.search(rf"^{line}$", text, re.MULTILINE), line
     assert "recipe" not in text and "_schema" not in text
+    text = help_of("evaluate")
+    assert re.search(r"^# Of random, blind .*\nenv: +# batched: All .*\.$", text, re.MULTILINE)
 
 
 def test_long_comments_are_wrapped(help_of):
