@@ -5,7 +5,7 @@ STAMP := $(VENV)/.installed
 # One thread for each process: two that fight over the cores are slower than one.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: setup train test slow lint gpu
+.PHONY: setup train test slow lint docs gpu
 
 setup: $(STAMP)
 
@@ -26,6 +26,9 @@ slow: setup
 
 gpu: setup
 	$(BIN)/python benchmarks/gpu.py $(or $(OUT),runs/gpu)
+
+docs: setup
+	$(BIN)/sphinx-build -W --keep-going -q -d build/doctrees docs build/docs
 
 lint: setup
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright

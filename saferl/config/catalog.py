@@ -36,10 +36,14 @@ def options(group: str, own: Path | None = None) -> dict[str, str]:
     found = {}
     folders = [Path(config_dir()), *([own] if own else [])]
     for path in sorted(file for folder in folders for file in (folder / group).glob("*.yaml")):
-        lines = path.read_text(encoding="utf-8").splitlines()
-        comments = [line[2:] for line in lines if line.startswith("# ") and line[2] != "@"]
-        found[path.stem] = comments[0] if comments else ""
+        found[path.stem] = headline(path.read_text(encoding="utf-8"))
     return found
+
+
+def headline(text: str) -> str:
+    """The first comment of a file of ``conf``, which says what it is; "" where there is none."""
+    lines = [line[2:] for line in text.splitlines() if line.startswith("# ") and line[2] != "@"]
+    return lines[0] if lines else ""
 
 
 def main(arguments: list[str] | None = None) -> None:

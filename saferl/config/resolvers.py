@@ -10,6 +10,8 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
+from saferl.config.comments import groups, settings
+
 # ${first:a,b} in a configuration is the first of its arguments that is not null.
 OmegaConf.register_new_resolver(
     "first", lambda *values: next(v for v in values if v is not None), replace=True
@@ -73,3 +75,7 @@ def env_name(identity: str) -> str:
 
 # ${env_name:${task.id}}
 OmegaConf.register_new_resolver("env_name", env_name, replace=True)
+
+# In a help text: ${groups:}, what there is to choose from, and ${settings:}, every setting with its comment.
+OmegaConf.register_new_resolver("groups", groups, replace=True)
+OmegaConf.register_new_resolver("settings", lambda *, _root_: settings(_root_), replace=True)

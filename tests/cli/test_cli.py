@@ -19,8 +19,6 @@ from small import EMPTY, SMALL, compose
 from saferl.algorithms.assemble import build_agent, build_trainer, load_agent
 from saferl.checkpoint.lock import alone
 from saferl.checkpoint.run import CONFIG, run_config
-from saferl.evaluation.compare import main as summarise
-from saferl.report.command import main as report
 
 TRAIN, TEST, EXPORT = ("train", "config"), ("evaluate", "evaluate"), ("export", "export")
 
@@ -179,6 +177,7 @@ def test_a_test_does_not_change_a_task_that_is_not_the_roads(tmp_path: Path, ref
         ("task.scenario=dense", "task.scenario: this policy's task is cart"),
         ("draw=all", "draw must be none and episode null, as task=cart draws no pictures"),
         ("episode=1", "draw must be none and episode null, as task=cart draws no pictures"),
+        ("trace=all", "trace must be none and why false, as task=cart is not the road"),
     ):
         assert words in refusal(*TEST, f"checkpoint={run}", option, "episodes=2", "out=test")
     assert not (tmp_path / "test").exists()
@@ -237,37 +236,8 @@ def test_help_lists_groups_and_settings(command, capsys):
         command(*TRAIN, "--help")
     assert not left.value.code
     text = capsys.readouterr().out
-    assert "python -m saferl algo=arsac task=gs" in text
-    assert (
-        "algo: arppo, arsac, arsac_plus, arsac_signed, asac, cpo, ppo" in text
-        and "gamma: 0.99" in text
-    )
-
-
-def test_the_readmes_everyday_commands_work_in_order(command, tmp_path: Path):
-    """With small budgets on an empty road, but otherwise as they stand there."""
-    readme = (Path(__file__).parents[2] / "README.md").read_text()
-    block = readme.partition("## Everyday commands")[2].split("```")[1]
-    lines = [line.partition("#")[0].split() for line in block.splitlines() if "-m saferl" in line]
-    assert len(lines) == 13
-    small = {"saferl": (*SMALL, *EMPTY), "saferl.evaluate": (*EMPTY, "episodes=1", "draw=none")}
-    for _, _, module, *arguments in lines:
-        name = module.partition(".")[2] or "train"
-        if "--help" in arguments:
-            continue
-        if name == "summary":
-            summarise(arguments)
-            continue
-        if name == "report":
-            report(arguments)
-            continue
-        if not any(argument.startswith("resume=") for argument in arguments):
-            arguments += small.get(module, ())
-        elif len(arguments) > 1:
-            arguments[1] = "frames=32"
-        command(name, "config" if name == "train" else name, *arguments)
-    assert "sac" in (tmp_path / "report/systems.csv").read_text()
-    assert (tmp_path / "test/metrics.json").is_file() and (tmp_path / "policy").is_dir()
+    assert "python -m saferl algo=arsac task=gs" in text and "gamma: 0.99" in text
+    assert "algo: arppo, arsac, arsac_plus, arsac_signed, arsac_unprojected, asac, cpo" in text
 
 
 def test_a_mistake_in_a_process_of_its_own(spawn, tmp_path: Path):
