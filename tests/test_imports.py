@@ -55,7 +55,7 @@ ROOMS = {
     "objectives": {"modules"},
     "checkpoint": {"config"},
     "evaluation": {"config", "checkpoint", "envs", "modules"},
-    "report": {"config", "checkpoint", "evaluation", "envs"},
+    "report": {"config", "algorithms", "checkpoint", "evaluation", "envs"},
     "training": {"config", "checkpoint", "evaluation", "envs", "objectives", "modules"},
     "config": {"envs"},
     "algorithms": {"config", "training", "checkpoint", "envs", "objectives", "modules"},

@@ -12,22 +12,32 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(
         "python -m saferl.report",
         description="The paper's tables, claims and learning curves from all runs below some folders, as report.md, "
-        "with tables in Markdown, LaTeX and CSV. Unfinished, damaged and foreign runs are listed with their reason.",
+        "with tables in Markdown, LaTeX and CSV, and as report.html, which also plays traces (python -m saferl.evaluate trace=all). Unfinished, damaged and foreign runs are listed with their reason.",
     )
     parser.add_argument("folders", nargs="+", type=Path, metavar="RUNS", help="runs lie below it")
     parser.add_argument("--out", type=Path, default=Path("report"), help="folder (report)")
     parser.add_argument(
         "--against", default="arsac", help="the system that others are compared with (arsac)"
     )
+    parser.add_argument(
+        "--play", type=int, default=0, metavar="N",
+        help="let each system play N episodes of one test again for report.html, crashes first (0)",
+    )  # fmt: skip
     given = parser.parse_args(arguments)
+    if given.play < 0:
+        raise SystemExit(f"error: --play must be >= 0, got {given.play}.")
     logging.basicConfig(level=logging.INFO, format="%(message)s")  # says when a driver plays
     from saferl.report.build import build  # late: help needs no torch
     from saferl.report.files import write
+    from saferl.report.html import write_page
+    from saferl.report.replays import lying, made
     from saferl.report.text import states, verdicts
 
     try:
         report = build(given.folders, given.out, given.against)
         path = write(report, given.out)
+        replays = made(report.runs, given.play, given.out / "traces", given.out / "drivers")
+        page = write_page(report, [*replays, *lying(given.folders)], given.out / "report.html")
     except (ValueError, OSError) as error:
         raise SystemExit(f"error: {error}") from None
-    print(f"Runs: {states(report.runs)}.\nClaims: {verdicts(report.claims)}.\n{path}")
+    print(f"Runs: {states(report.runs)}.\nClaims: {verdicts(report.claims)}.\n{path}\n{page}")

@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from saferl.envs.intersection.pictures import EGO, INK, OTHERS
+from saferl.envs.intersection.scene import EGO, INK, OTHERS
 from saferl.evaluation.statistics import WINDOW
 from saferl.report.curves import Curve
 from saferl.report.systems import LABELS

@@ -40,7 +40,6 @@ SCALES = {
     "attention": 10_000,
     "cost_share": 10_000,
     "cost": 10_000,
-    "reward": 1000,
     "gap": 100,
     "nearest": 1,
     "observed": 1,
@@ -66,7 +65,7 @@ def packed(trace: Trace) -> dict[str, Any]:
         scaled = np.round(values * np.asarray(scale)).clip(-32767, 32767)
         whole = np.where(np.isnan(scaled), NOTHING, scaled).astype(np.int16)
         columns.append(whole.reshape(len(values), -1).T)
-        layout.append([name, list(shape), scale if isinstance(scale, tuple) else [scale]])
+        layout.append([name, list(shape), np.atleast_1d(scale).tolist()])
     table = np.concatenate(columns)
     steps = np.diff(table, axis=1, prepend=np.int16(0))  # wraps, and so does their sum
     data = gzip.compress(steps.astype("<i2").tobytes(), 9, mtime=0)

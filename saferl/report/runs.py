@@ -30,8 +30,10 @@ CURVE, TIMING, FAILED = "metrics.csv", "timing.csv", "error.txt"
 _ROAD = "saferl.envs.intersection.Scenario"
 #: What may differ between repetitions: it changes where, how fast or how often something is done, and no result.
 _FREE = (*REPETITION, *MADE, "record_every")
-#: What systems that are compared have in common: the task, but for a reward of their own in training, the budget and the test.
-_COMMON = ("task", "frames", "episodes", "evaluation.episodes")
+#: What systems that are compared have in common: the task, but for a reward of their own in training, and the test.
+_COMMON = ("task", "evaluation.episodes")
+#: And those of a family, off-policy or on-policy: an update of one is dearer than of the other.
+_BUDGET = ("frames", "episodes")
 _OWN = "task.reward.risk_shaping"
 
 
@@ -70,7 +72,7 @@ class Run:
 def find(folders: Sequence[Path]) -> list[Run]:
     """All runs below these folders, seeds in order.
 
-    A run is ``foreign`` if it is none of the road, if its task, observation, budget or test is not that of most finished runs, if
+    A run is ``foreign`` if it is none of the road, if its task, observation or test is not that of most finished runs, its budget not that of most of its family, if
     it differs in another setting from most of its own algorithm, or if it repeats a seed.
 
     Raises:
@@ -154,7 +156,8 @@ def _progress(folder: Path, settings: Mapping[str, Any]) -> str:
 
 def _strangers(runs: list[Run]) -> list[Run]:
     """The same runs, those foreign that do not go with the rest."""
-    runs = _apart(runs, lambda run: "", _common, "the others have")
+    runs = _apart(runs, lambda run: "", _those(_COMMON), "the others have")
+    runs = _apart(runs, _family, _those(_BUDGET), "the others have")
     runs = _apart(runs, lambda run: run.algo, _composition, "others of its algorithm have")
     first: dict[tuple[str, int], Path] = {}
     for index, run in enumerate(runs):
@@ -166,12 +169,21 @@ def _strangers(runs: list[Run]) -> list[Run]:
     return runs
 
 
-def _common(run: Run) -> dict[str, Any]:
-    return {
-        key: value
-        for key, value in run.settings.items()
-        if key != _OWN and any(f"{key}.".startswith(f"{part}.") for part in _COMMON)
-    }
+def _family(run: Run) -> str:
+    return str(run.settings.get("learning._target_"))
+
+
+def _those(names: Sequence[str]) -> Callable[[Run], dict[str, Any]]:
+    """The settings of a run of these names, or below them."""
+
+    def settings(run: Run) -> dict[str, Any]:
+        return {
+            key: value
+            for key, value in run.settings.items()
+            if key != _OWN and any(f"{key}.".startswith(f"{name}.") for name in names)
+        }
+
+    return settings
 
 
 def _composition(run: Run) -> dict[str, Any]:

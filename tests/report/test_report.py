@@ -221,7 +221,7 @@ def test_the_command(report, capsys, monkeypatch):
     main([folder, "--out", str(out), "--against", "sac"])
     told = capsys.readouterr().out
     assert told.startswith("Runs: 10 finished, 1 broken, 1 foreign.\nClaims: ")
-    assert told.rstrip().endswith("report.md")
+    assert told.rstrip().endswith("report.html")
     assert "P(CR below SAC's)" in (out / "report.md").read_text()
     for arguments, line in (
         ([folder, "--against", "scripted"], "--against must be among cpo, "),

@@ -82,6 +82,7 @@ def test_what_does_not_go_with_the_rest_is_foreign(tmp_path: Path):
         make(tmp_path / f"own{seed}", seed=seed)
     make(tmp_path / "sac", "sac", options=["env.num_envs=8", "record_every=77", "threads=1"])
     make(tmp_path / "shaped", "sac_rs")  # its reward in training is its own
+    make(tmp_path / "ppo", "ppo_rs", options=["frames=60000"])  # of another family
     make(tmp_path / "long", "sac", options=["frames=60000"])
     make(tmp_path / "world", "rsac", options=["task.observation=world"])
     make(tmp_path / "task", "asac", options=["task=gs"])
@@ -90,7 +91,7 @@ def test_what_does_not_go_with_the_rest_is_foreign(tmp_path: Path):
     make(tmp_path / "twice", "arsac", 1)
     make(tmp_path / "cart", "sac", options=["task=cart"])
     found = states(tmp_path)
-    own = {"own0", "own1", "own2", "sac", "shaped"}
+    own = {"own0", "own1", "own2", "sac", "shaped", "ppo"}
     assert {name for name, (state, _) in found.items() if state == FINISHED} == own
     told = {name: reason for name, (state, reason) in found.items() if state == FOREIGN}
     assert told["long"] == "frames=60000 (the others have 30000)"

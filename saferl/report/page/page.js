@@ -141,7 +141,7 @@ const CHARTS = [
     { name: "proposed", colour: "after", dash: true, of: (r, i) => at(r, "risk", i) },
     { name: "executed", colour: "ego", of: (r, i) => at(r, "risk_executed", i) }] },
   { title: "cost of the decision", unit: "", least: [0, 0.05], lines: [{ name: "cost", colour: "risk", of: (r, i) => at(r, "cost", i) }] },
-  { title: "gap to the nearest car", unit: "m", least: [0, 20], lines: [{ name: "gap", colour: "first", of: (r, i) => at(r, "gap", i) }] },
+  { title: "gap to the nearest car", unit: "m", least: [0, 20], lines: [{ name: "gap", colour: "ego", of: (r, i) => at(r, "gap", i) }] },
 ];
 
 function swatch(name, text) {
@@ -183,7 +183,7 @@ function build() {
   });
   const legend = [...swatch("ego", "ego"), ...swatch("first", "goes first by the rules of the road"),
     ...swatch("after", "comes after the ego"), ...swatch("risk", "outlined: a predicted collision is part of the cost"),
-    ...swatch("halo", "ring: the policy looks at it (width: root of its share of the attention)"), " · pale: not observed"];
+    ...swatch("halo", "ring: the policy looks at it (width: root of its share of the attention)"), " · pale: not observed", ...swatch("halo", "shaded in the curves: the projector acted")];
   $("legend").replaceChildren(...legend);
 }
 
@@ -374,28 +374,24 @@ function draw() {
 
 // --- playing ------------------------------------------------------------------------------------
 
-let before = null, owed = 0;
-function tick(now) {
-  if (!state.playing) return;
-  owed += before === null ? 0 : ((now - before) / 1000) * Number($("speed").value);
+let timer = null, before = 0, owed = 0;
+function tick() {
+  const now = performance.now();
+  owed += ((now - before) / 1000) * Number($("speed").value);
   before = now;
-  const steps = Math.floor(owed / dt());
-  if (steps > 0) {
-    owed -= steps * dt();
-    state.row = Math.min(longest() - 1, state.row + steps);
-    if (state.row >= longest() - 1) state.playing = false;
-    draw();
-  }
-  requestAnimationFrame(tick);
+  const steps = Math.floor(owed / dt() + 1e-6);
+  if (steps < 1) return;
+  owed -= steps * dt();
+  state.row = Math.min(longest() - 1, state.row + steps);
+  if (state.row >= longest() - 1) play(false); else draw();
 }
 
 function play(on) {
   if (on && state.row >= longest() - 1) state.row = 0;
   state.playing = on;
-  before = null;
-  owed = 0;
+  clearInterval(timer);
+  if (on) { before = performance.now(); owed = 0; timer = setInterval(tick, 25); }
   draw();
-  if (on) requestAnimationFrame(tick);
 }
 
 function toTheEnd() {
@@ -403,6 +399,35 @@ function toTheEnd() {
   state.row = Math.max(0, count(run, episode) - 1 - Math.round(2 / dt()));
   draw();
 }
+
+// --- curves -------------------------------------------------------------------------------------
+
+const PANELS = { collision_rate: ["collision rate", 1], frozen_rate: ["frozen rate", 1], success_rate: ["success rate", 1],
+  return: ["return of an episode", 0], cost_return: ["cost of an episode", 0], lagrange_multiplier: ["multiplier", 0],
+  intervention_rate: ["interventions of the projector", 1] };
+const PALETTE = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#882255", "#332288", "#4f4111", "#8c4d47"];
+
+window.onreport = () => {
+  if (!$("curves") || !window.Plotly) return;
+  const names = [...new Set(DATA.curves.flatMap((panel) => panel.systems.map((s) => s.name)))];
+  const ink = colour("ink"), line = colour("line"), columns = $("curves").clientWidth < 700 ? 1 : 2;
+  const rows = Math.ceil(DATA.curves.length / columns), traces = [];
+  const layout = { grid: { rows, columns, pattern: "independent", ygap: 0.28, xgap: 0.12 }, height: 300 * rows + 60, margin: { l: 55, r: 10, t: 30, b: 45 },
+    paper_bgcolor: colour("ground"), plot_bgcolor: colour("ground"), font: { color: ink, size: 12 }, legend: { orientation: "h", y: 1.02, yanchor: "bottom" },
+    hovermode: "x unified", annotations: [] };
+  DATA.curves.forEach((panel, place) => {
+    const end = place ? String(place + 1) : "", [title, rate] = PANELS[panel.figure] || [panel.figure, 0];
+    layout[`xaxis${end}`] = { gridcolor: line, zeroline: false, title: { text: "frames", standoff: 4 } };
+    layout[`yaxis${end}`] = { gridcolor: line, zeroline: false, title: { text: title }, ...(rate ? { tickformat: ".0%", rangemode: "tozero" } : {}) };
+    panel.systems.forEach((s) => {
+      const tint = PALETTE[names.indexOf(s.name) % PALETTE.length], axes = { xaxis: `x${end}`, yaxis: `y${end}`, legendgroup: s.name };
+      if (s.low.some((v) => v !== null)) traces.push({ ...axes, x: [...s.frames, ...s.frames.slice().reverse()], y: [...s.high, ...s.low.slice().reverse()],
+        fill: "toself", fillcolor: `${tint}2a`, line: { width: 0 }, hoverinfo: "skip", showlegend: false, type: "scatter", mode: "lines" });
+      traces.push({ ...axes, x: s.frames, y: s.mean, name: s.name, mode: "lines", line: { color: tint, width: 2 }, showlegend: !traces.some((t) => t.name === s.name) });
+    });
+  });
+  Plotly.react($("curves"), traces, layout, { displaylogo: false, responsive: true });
+};
 
 // --- addresses ----------------------------------------------------------------------------------
 
@@ -446,7 +471,7 @@ async function start() {
   options($("task"), [["", "all"], ...[...new Set(Object.values(TASK_OF))].map((t) => [t, t])], "");
   options($("outcome"), [["", "all"], ["crash", "a crash"], ...Object.entries(ENDS)], "");
   $("show-replay").hidden = !DATA.runs.length;
-  $("show-report").addEventListener("click", () => { state.playing = false; history.replaceState(null, "", "#report"); show("report"); });
+  $("show-report").addEventListener("click", () => { play(false); history.replaceState(null, "", "#report"); show("report"); });
   $("show-replay").addEventListener("click", () => { history.replaceState(null, "", "#replay"); show("replay"); });
   $("run").addEventListener("change", () => choose({ run: DATA.runs.findIndex((r) => runName(r) === $("run").value), other: -1, row: 0 }));
   $("seed").addEventListener("change", () => choose({ run: Number($("seed").value), other: -1, row: 0 }));
@@ -467,7 +492,7 @@ async function start() {
   window.addEventListener("resize", () => { if (!$("replay").hidden) draw(); });
   window.addEventListener("hashchange", follow);
   document.addEventListener("keydown", (event) => {
-    if ($("replay").hidden || event.target.matches("select, input[type=text]") || event.ctrlKey || event.metaKey || event.altKey) return;
+    if ($("replay").hidden || event.target.matches?.("select") || event.ctrlKey || event.metaKey || event.altKey) return;
     const by = event.shiftKey ? Math.round(1 / dt()) : 1;
     const keys = { " ": () => play(!state.playing), ArrowRight: () => { state.row = Math.min(longest() - 1, state.row + by); draw(); },
       ArrowLeft: () => { state.row = Math.max(0, state.row - by); draw(); }, n: () => step(1), p: () => step(-1), c: toTheEnd };

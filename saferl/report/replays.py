@@ -1,0 +1,110 @@
+"""The traces that a report plays: those that lie there, and those that it makes."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+
+import hydra
+import numpy as np
+
+from saferl.algorithms.assemble import build_env
+from saferl.algorithms.policy import trained_agent
+from saferl.checkpoint.run import CONFIG, run_config
+from saferl.envs.intersection import Scenario
+from saferl.envs.intersection.true_scene import TrueScene
+from saferl.evaluation.play import envs_at_once
+from saferl.evaluation.rows import read
+from saferl.evaluation.trace import TRACE, Trace, record
+from saferl.report.drivers import DRIVERS
+from saferl.report.runs import FINISHED, Run
+from saferl.report.systems import LABELS
+
+log = logging.getLogger(__name__)
+
+_AT_ONCE = 250
+
+
+def lying(folders: Sequence[Path]) -> list[Trace]:
+    """All traces below these folders, each named by the run that it is of, if it is of one; of a damaged one a line is said."""
+    paths = {path.resolve(): path for each in folders for path in sorted(each.glob(f"**/{TRACE}"))}
+    traces = []
+    for path in paths.values():
+        try:
+            traces.append(_named(Trace.load(path), path))
+        except (ValueError, OSError) as error:
+            log.warning("Left out: %s", error)
+    return traces
+
+
+def _named(trace: Trace, path: Path) -> Trace:
+    run = next((each for each in path.parents if (each / CONFIG).is_file()), None)
+    if run is None:
+        return trace
+    cfg = run_config(run)
+    label = LABELS.get(cfg.algo_name, cfg.algo_name)
+    return dataclasses.replace(
+        trace, about={**trace.about, "label": label, "training_seed": cfg.seed}
+    )
+
+
+def made(runs: Sequence[Run], count: int, out: Path, drivers: Path) -> list[Trace]:
+    """The same episodes with each system: its first run and the scripted drivers play them again, or are read if they have.
+
+    Args:
+        runs: as found; those of one seed that most systems have are played.
+        count: of episodes: first those in which most systems crashed, then from the test's beginning.
+        out: folder of the traces.
+        drivers: folder of the drivers' tests.
+    """
+    finished = [run for run in runs if run.state == FINISHED]
+    if not finished or count < 1:
+        return []
+    seeds = [run.seed for run in finished]
+    seed = max(sorted(set(seeds)), key=seeds.count)
+    chosen = [run for run in finished if run.seed == seed]
+    folders = {run.algo: run.folder / "evaluation" for run in chosen}
+    folders |= {name: drivers / f"{name}-seed{seed}" for name in DRIVERS}
+    tests = {name: read(folder / "episodes.csv") for name, folder in folders.items()}
+    crashes = sum(tests[run.algo]["collision"] for run in chosen)
+    wanted = np.sort(np.argsort(-np.asarray(crashes), kind="stable")[:count])
+    traces = []
+    for name, test in tests.items():
+        rows = [{key: column[index].item() for key, column in test.items()} for index in wanted]
+        rows = [row | {key: int(row[key]) for key in ("episode", "seed")} for row in rows]
+        folder, run = out / f"{name}-seed{seed}", next((r for r in chosen if r.algo == name), None)
+        traces.append(_trace(name, run, chosen[0], rows, folder, seed))
+    return traces
+
+
+def _trace(
+    name: str, run: Run | None, first: Run, rows: list[dict], folder: Path, seed: int
+) -> Trace:
+    """One system's trace of these episodes; of a scripted driver where there is no run."""
+    about = {"label": LABELS.get(name, name)} | ({} if run is None else {"training_seed": seed})
+    try:
+        trace = Trace.load(folder)
+        if trace.episodes["seed"].tolist() == [row["seed"] for row in rows]:
+            return trace
+    except (OSError, ValueError):  # not there, or cut off
+        pass
+    log.info("%s plays %d episodes again.", about["label"], len(rows))
+    cfg = run_config((run or first).folder)
+    cfg.device = "cpu"
+    cfg.env.compile_physics = False
+    if "compile" in cfg.projector:
+        cfg.projector.compile = False
+    scenario: Scenario = hydra.utils.instantiate(cfg.task).as_test()
+    width = envs_at_once(len(rows), _AT_ONCE)
+    if run is None:
+        policy, transforms, critics = scenario.driver(name, seed), [], None
+    else:
+        agent = trained_agent(cfg, run.folder)
+        policy, transforms, critics = agent.actor, agent.transforms, agent.risk
+    with closing(build_env(cfg.env, scenario, width, 0, "cpu", [TrueScene(), *transforms])) as env:
+        trace = record(policy, env, rows, critics, cfg.risk_limit, policy=name, **about)
+    trace.save(folder)
+    return trace
