@@ -71,6 +71,7 @@ def test_of_nothing(arguments: list[str]):
         ["projection", "{run}", "--samples", "64"],
         ["backends", "{run}", "--episodes", "4", "--tasks", "gs", "--drivers", "blind"],
         ["curves", "{out}/curves.png", "ARSAC={run}"],
+        ["trajectories", "{run}", "blind", "--episode", "1", "--out", "{out}"],
         ["compare", "{run}/test", "{run}/test"],
         ["ablation", "{out}", "--train", "gs", *ABLATION, "--set", "frames=512", *FAST],
         ["time_to_safe", "{out}", "--runs", "algo=rsac", "--minutes", "0.2", "--every", "0.1", "--episodes", "4",

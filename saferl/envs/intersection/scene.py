@@ -177,19 +177,24 @@ def draw_star(axes: Axes, x: float, y: float, size: float = 160) -> PathCollecti
     )
 
 
-def seconds(count: int, dt: float, every: int = 1) -> list[int]:
-    """Which of ``count`` states are at whole seconds, or at every second or third of these.
+def seconds(count: int, dt: float) -> list[int]:
+    """Which of ``count`` states are at whole seconds.
 
     >>> seconds(6, dt=0.4)
     [0, 2, 5]
     """
-    last = int((count - 1) * dt + 1e-6)
-    return [round(second / dt) for second in range(0, last + 1, every)]
+    return [round(second / dt) for second in range(int((count - 1) * dt + 1e-6) + 1)]
+
+
+def _seen(axes: Axes, state: np.ndarray) -> bool:
+    """Whether a car is in view, and on the road."""
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    return bool(left < state[0] < right and top < state[1] < bottom)
 
 
 def draw_way(
     axes: Axes, states: np.ndarray, dt: float, colour: str, label: str = "", pale: float = 0.2,
-    final: float = 1.0, every: int = 1,
+    final: float = 1.0,
 ) -> list[Shape]:  # fmt: skip
     """Draw the line of a car's way [T, 6]; returns the car at every whole second, pale, and at its end.
 
@@ -197,17 +202,15 @@ def draw_way(
 
     Args:
         pale, final: how opaque.
-        every: seconds between two pictures.
     """
     x, y = states[:, :2].T.copy()
     jump = np.hypot(np.diff(x), np.diff(y)) > SPACING  # another car that took the number
     x[1:][jump] = np.nan
     axes.plot(x, y, color=colour, lw=1.4, alpha=0.6, zorder=2)
-    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     last, kept, shown = len(states) - 1, None, []
-    for index in [last, *reversed(seconds(last + 1, dt, every))]:
+    for index in [last, *reversed(seconds(last + 1, dt))]:
         state = states[index]
-        if not (left < state[0] < right and top < state[1] < bottom):  # or not on the road
+        if not _seen(axes, state):
             continue
         if kept is None or np.hypot(*(state - kept)[:2]) > SPACING:
             name, alpha = "" if kept is not None else label, pale if index < last else final
@@ -217,14 +220,14 @@ def draw_way(
 
 
 def write_times(
-    axes: Axes, states: np.ndarray, dt: float, colour: str, every: int = 1, fontsize: float = 7
+    axes: Axes, states: np.ndarray, dt: float, colour: str, fontsize: float = 7
 ) -> None:
     """Whole seconds to the right of a car's way [T, 6]; where it waits, from when to when."""
     stops: list[list[int]] = []
-    for index in seconds(len(states), dt, every):
+    for index in seconds(len(states), dt):
         if stops and np.hypot(*(states[index] - states[stops[-1][0]])[:2]) < SPACING / 2:
             stops[-1][1] = index
-        elif np.isfinite(states[index, 0]):
+        elif _seen(axes, states[index]):
             stops.append([index, index])
     for first, final in stops:
         begin, end = round(first * dt), round(final * dt)
@@ -237,21 +240,18 @@ def write_times(
         )  # fmt: skip
 
 
-def draw_ways(
-    axes: Axes, episode: Episode, ego: str = EGO, others: str | None = None, every: int = 1
-) -> None:
+def draw_ways(axes: Axes, episode: Episode, ego: str = EGO, others: str | None = None) -> None:
     """The ways of all cars, with their numbers. The others lie below the ego's and shine through each other, so that
     whoever comes late hides nothing.
 
     Args:
         ego: its colour.
         others: the colour of all others; None: each has its own.
-        every: seconds between two pictures of a car.
     """
     shapes: list[Shape] = []
     for number, states in enumerate(np.stack(episode.others, 1)):
         colour = others or colour_of(number)
-        shapes += draw_way(axes, states, episode.dt, colour, str(number), 0.2, 0.8, every)
+        shapes += draw_way(axes, states, episode.dt, colour, str(number), 0.2, 0.8)
     draw_cars(axes, shapes, zorder=3)
-    own = draw_way(axes, np.stack(episode.ego), episode.dt, ego, pale=0.4, every=every)
+    own = draw_way(axes, np.stack(episode.ego), episode.dt, ego, pale=0.4)
     draw_cars(axes, own, zorder=3.5)
