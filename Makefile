@@ -5,7 +5,7 @@ STAMP := $(VENV)/.installed
 # One thread for each process: two that fight over the cores are slower than one.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: setup train test slow lint docs gpu
+.PHONY: setup train test slow lint docs gpu generalisation
 
 setup: $(STAMP)
 
@@ -29,6 +29,15 @@ gpu: setup
 
 docs: setup
 	$(BIN)/sphinx-build -W --keep-going -q -d build/doctrees docs build/docs
+
+# One table of RUN and two drivers: other traffic, the other backend, without the projector.
+CONDITIONS = task=$(or $(TASK),mixed) task.scenario=nominal,dense,aggressive,noisy env=batched,highway \
+	episodes=$(or $(EPISODES),100) out=$(or $(OUT),generalisation)
+
+generalisation: setup
+	test -n "$(RUN)" || { echo "Give RUN=FOLDER, or several, RUN=A,B."; exit 1; }
+	$(BIN)/python -m saferl.evaluate -m policy=scripted,blind $(CONDITIONS)
+	$(BIN)/python -m saferl.evaluate -m checkpoint=$(RUN) project=true,false $(CONDITIONS)
 
 lint: setup
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright

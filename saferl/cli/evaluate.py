@@ -142,6 +142,7 @@ def evaluate(cfg: DictConfig) -> None:
         episodes=cfg.episodes,
         seed=cfg.seed,
         device=cfg.device,
+        changed=changed(HydraConfig.get().overrides.task),
     )
     pictures(cfg.env, task, who, drawn(rows, cfg), out, cfg.device, cfg.draw_format)
     if isinstance(task, Scenario):
@@ -172,6 +173,17 @@ def look_into(cfg: DictConfig, task: Scenario, who: Candidate, rows: list[dict],
                 writer.writeheader()
                 writer.writerows(crashes)
         log.info("\n%s", crash_table(crashes, len(rows)))
+
+
+def changed(overrides: Sequence[str]) -> dict[str, str]:
+    """What a command line says of single settings of task and environment.
+
+    >>> changed(["task=lt", "+task.traffic.respawn=true", "env.num_envs=3"])
+    {'task.traffic.respawn': 'true'}
+    """
+    told = dict(override.lstrip("+").split("=", 1) for override in overrides if "=" in override)
+    told.pop("env.num_envs", None)  # no figure depends on it
+    return {key: value for key, value in told.items() if key.startswith(("task.", "env."))}
 
 
 def compiling(cfg: DictConfig, on: bool) -> DictConfig:
@@ -271,8 +283,9 @@ def measure(
     episodes: int,
     seed: int,
     device: str,
+    **about: Any,
 ) -> list[dict]:
-    """Play, write ``metrics.json`` and ``episodes.csv``, report the table; returns the rows."""
+    """Play, write ``metrics.json`` (with what ``about`` says) and ``episodes.csv``, report the table; returns the rows."""
     at_once = envs_at_once(episodes, num_envs)
     with closing(build_env(env, task, at_once, seed, device_of(device), who.transforms)) as several:
         rows = play_episodes(who.policy, several, episodes, seed)
@@ -291,6 +304,7 @@ def measure(
         episodes=episodes,
         seed=seed,
         **who.about,
+        **about,
     )
     title = f"{who.name}: {episodes} episodes of {task.title}"
     log.info("\n%s", table(figures, title, who.about.get("cost_limit")))

@@ -1,4 +1,4 @@
-"""The closing tests of runs side by side."""
+"""Tests side by side: the closing ones of runs, and those of ``python -m saferl.evaluate``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,9 @@ from saferl.config.flat import flat
 #: Not the composition: what tells its repetitions apart.
 REPETITION = ("seed", "out")
 COLUMNS = ("success_rate", "collision_rate", "return", "cost_return")
-
+RATES = ("collision_rate", "success_rate", "frozen_rate")
+#: What a table of tests names first of what tells them apart.
+FIRST = ("policy", "task", "scenario", "env", "project")
 
 #: A run's closing test, once it is over.
 TESTED = "evaluation/metrics.json"
@@ -33,6 +35,15 @@ class Summary(Callback):
             print(side_by_side(runs))
 
 
+class SummaryOfTests(Callback):
+    """Hydra's callback that prints :func:`conditions_side_by_side` of all tests of a sweep."""
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        tests = measured_below([Path(config.hydra.sweep.dir)])
+        if len(tests) > 1:
+            print(conditions_side_by_side(tests))
+
+
 def finished(folders: Sequence[Path]) -> list[tuple[Mapping, Mapping]]:
     """Configuration and figures of every run below these folders whose closing test is over."""
     from saferl.checkpoint.run import CONFIG  # late: help and most mistakes need no torch
@@ -43,6 +54,25 @@ def finished(folders: Sequence[Path]) -> list[tuple[Mapping, Mapping]]:
         for test in sorted(tests, key=lambda path: (len(str(path)), path))  # 2 before 10
         if (config := test.parents[1] / CONFIG).is_file()
     ]
+
+
+def measured_below(folders: Sequence[Path]) -> list[Mapping]:
+    """What ``metrics.json`` says of every test below these folders but the closing ones of runs, the oldest first."""
+    from saferl.checkpoint.run import CONFIG
+
+    def closing(test: Path) -> bool:
+        return any(
+            folder.name == "evaluation" and (folder.parent / CONFIG).is_file()
+            for folder in test.parents
+        )
+
+    tests = [test for folder in folders for test in folder.glob("**/metrics.json")]
+    tests = sorted({test for test in tests if not closing(test)}, key=_age)
+    return [figures for figures in map(_figures, tests) if "policy" in figures]
+
+
+def _age(path: Path) -> tuple[int, str]:
+    return path.stat().st_mtime_ns, str(path)
 
 
 def _figures(test: Path) -> Mapping:
@@ -82,23 +112,68 @@ def side_by_side(runs: Sequence[tuple[Mapping, Mapping]], columns: Sequence[str]
         Means with 95% intervals: over seeds (Student's t, wide for few; of rates never narrower than Wilson's of
         all their episodes), of a single seed over its episodes.
     """
+    groups: dict[tuple[str, ...], list[Mapping]] = {}
+    for name, (_, figures) in zip(names([config for config, _ in runs]), runs, strict=True):
+        groups.setdefault((name,), []).append(figures)
+    rows = {(*name, str(len(tests))): tests for name, tests in groups.items()}
+    return _laid_out(("", "runs"), rows, columns)
+
+
+def conditions_side_by_side(tests: Sequence[Mapping]) -> str:
+    """A table of tests, one row for each policy and setting, its seeds taken together.
+
+    Args:
+        tests: what ``metrics.json`` says of each.
+
+    Returns:
+        The settings in which the tests differ, unless those before them in the row tell them; scripted drivers stand first;
+        rates with intervals as in :func:`side_by_side`, or return and cost where there are none. What one test
+        repeats of another (a policy has no projector to leave out) counts once.
+    """
     from saferl.evaluation.statistics import FIGURES
 
-    groups: dict[str, list[Mapping]] = {}
-    for name, (_, figures) in zip(names([config for config, _ in runs]), runs, strict=True):
-        groups.setdefault(name, []).append(figures)
-    columns = [name for name in columns if any(name in figures for _, figures in runs)]
-    titles = [FIGURES[name][0] + " %" * name.endswith("_rate") for name in columns]
-    rows = [["", "runs", *titles]]
-    for name, tests in groups.items():
-        row = [name, str(len(tests))]
-        for column in columns:
-            row.append(cell([figures for figures in tests if column in figures], column))
-        rows.append(row)
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    settings = [flat({k: v for k, v in test.items() if k not in FIGURES}) for test in tests]
+
+    def told(keys: Sequence[str]) -> list[tuple[str, ...]]:
+        return [tuple(str(each.get(key, "-")) for key in keys) for each in settings]
+
+    heads: list[str] = []
+    for key in dict.fromkeys([*FIRST, *(key for each in settings for key in each)]):
+        new = len({*told([*heads, key])}) > len({*told(heads)})
+        if new and key not in (*REPETITION, "episodes"):
+            heads.append(key)
+    once = dict(zip(map(str, settings), range(len(tests)), strict=True))
+    policies = list(dict.fromkeys(each["policy"] for each in settings))
+    policies.sort(key=lambda policy: " (" in policy)  # of a checkpoint
+    groups: dict[tuple[str, ...], list[Mapping]] = {}
+    for k in sorted(once.values(), key=lambda k: policies.index(settings[k]["policy"])):
+        groups.setdefault(told(heads)[k], []).append(tests[k])
+    rows = {
+        (*label, str(sum(test["episodes"] for test in some))): some
+        for label, some in groups.items()
+    }
+    heads = [head.removeprefix("changed.") for head in heads]
+    rated = any(name in test for test in tests for name in RATES)
+    return _laid_out((*heads, "episodes"), rows, RATES if rated else ("return", "cost_return"))
+
+
+def _laid_out(
+    heads: Sequence[str], rows: Mapping[tuple[str, ...], Sequence[Mapping]], columns: Sequence[str]
+) -> str:
+    """A table of labels and, of the tests of each, the figures that some test has."""
+    from saferl.evaluation.statistics import FIGURES
+
+    columns = [
+        name for name in columns if any(name in test for some in rows.values() for test in some)
+    ]
+    lines = [(*heads, *(FIGURES[name][0] + " %" * name.endswith("_rate") for name in columns))]
+    for label, tests in rows.items():
+        cells = (cell([test for test in tests if name in test], name) for name in columns)
+        lines.append((*label, *cells))
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join(
-        "  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
-        for row in rows
+        "  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip()
+        for line in lines
     )
 
 
@@ -128,20 +203,22 @@ def cell(tests: Sequence[Mapping[str, Any]], name: str) -> str:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Print the table of all runs below these folders."""
+    """Print a table of all runs, and one of all other tests, below these folders."""
     parser = argparse.ArgumentParser("python -m saferl.summary", description=__doc__)
     parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="runs lie below it")
     folders = parser.parse_args(arguments).folders
     try:
-        runs = finished(folders)
+        runs, tests = finished(folders), measured_below(folders)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from None
-    if not runs:
+    if not runs and not tests:
         raise SystemExit(
-            f"error: no run below {', '.join(map(str, folders))} has been tested: give folders of runs, "
+            f"error: no run below {', '.join(map(str, folders))} has been tested: give folders of runs or tests, "
             "as python -m saferl.summary multirun runs."
         )
+    tables = [side_by_side(runs)] if runs else []
+    tables += [conditions_side_by_side(tests)] if tests else []
     try:
-        print(side_by_side(runs), flush=True)
+        print("\n\n".join(tables), flush=True)
     except BrokenPipeError:  # whoever read our output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -50,6 +50,46 @@ def test_train_from_any_folder_then_multirun(command, tmp_path: Path, capsys):
         assert re.match(algo + r" gs +2 +\S+ \[\S+, \S+\]  ", line)
 
 
+def test_tests_of_a_sweep_end_with_one_table_and_those_before_stand_in_it(
+    command, tmp_path: Path, capsys
+):
+    """Drivers, then a run with and without its projector, in other traffic and on the other backend."""
+    short = ("task=gs", "task.duration=1", "episodes=3", "env.num_envs=3", "out=tests")
+    where = ("task.scenario=nominal,dense", "env=batched,highway")
+    run = (*SMALL, "algo=rsac", "task=gs", "task.vehicles=null", "projector.steps=2", "out=run")
+    command(*TRAIN, *run, "task.duration=1")
+    command(*TEST, "-m", "policy=scripted,blind", *short, *where)
+    drivers = capsys.readouterr().out.splitlines()[-9:]
+    assert drivers[0].split()[:4] == ["policy", "scenario", "env", "episodes"]
+    assert [line.split()[0] for line in drivers[1:]] == ["scripted"] * 4 + ["blind"] * 4
+
+    command(*TEST, "-m", "checkpoint=run", *short, *where, "project=true,false")
+    head, *lines = capsys.readouterr().out.splitlines()[-17:]
+    assert head.split() == [
+        "policy",
+        "scenario",
+        "env",
+        "project",
+        "episodes",
+        "CR",
+        "%",
+        "SR",
+        "%",
+        "FR",
+        "%",
+    ]
+    rows = [line.replace("rsac (run)", "rsac").split()[:5] for line in lines]
+    assert rows[:8] == [[*line.split()[:3], "False", "3"] for line in drivers[1:]]
+    assert sorted(map(tuple, rows[8:])) == sorted(
+        ("rsac", scenario, f"{env}Intersection", project, "3")
+        for scenario in ("nominal", "dense")
+        for env in ("Batched", "Highway")
+        for project in ("True", "False")
+    )
+    summarise(["tests"])
+    assert capsys.readouterr().out.splitlines() == [head, *lines]
+
+
 def test_one_refused_job_of_a_sweep_stops_no_other(command, tmp_path: Path, capsys):
     """It is told at the end and by its folder; the same command again does what is missing, and only that."""
     small = [setting for setting in SMALL if "batch_size" not in setting]
