@@ -46,11 +46,9 @@ def build(folders: Sequence[Path], out: Path, against: str = "arsac") -> Report:
         against: name of the system that the others are compared with.
 
     Raises:
-        ValueError: a folder is not there, there is no run below them, or none of ``against``'s name is known.
+        ValueError: a folder is not there, or none of ``against``'s name is known.
     """
     runs = find(folders)
-    if not runs:
-        raise ValueError(f"no run below {', '.join(map(str, folders))}: give folders of runs.")
     known = dict.fromkeys([*LABELS, *(run.algo for run in runs if run.algo)])
     if against not in known or against in DRIVERS:
         known = [name for name in known if name not in DRIVERS]

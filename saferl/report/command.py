@@ -34,10 +34,14 @@ def main(arguments: list[str] | None = None) -> None:
     from saferl.report.text import states, verdicts
 
     try:
-        report = build(given.folders, given.out, given.against)
-        path = write(report, given.out)
-        replays = made(report.runs, given.play, given.out / "traces", given.out / "drivers")
-        page = write_page(report, [*replays, *lying(given.folders)], given.out / "report.html")
+        report, traces = build(given.folders, given.out, given.against), lying(given.folders)
+        if not report.runs and not traces:
+            names = ", ".join(map(str, given.folders))
+            raise ValueError(f"no run and no trace below {names}: give folders of runs or tests.")
+        if report.runs:
+            print(f"Runs: {states(report.runs)}.\nClaims: {verdicts(report.claims)}.")
+            print(write(report, given.out), flush=True)
+        made_now = made(report.runs, given.play, given.out / "traces", given.out / "drivers")
+        print(write_page(report, [*made_now, *traces], given.out / "report.html"))
     except (ValueError, OSError) as error:
         raise SystemExit(f"error: {error}") from None
-    print(f"Runs: {states(report.runs)}.\nClaims: {verdicts(report.claims)}.\n{path}\n{page}")

@@ -36,6 +36,15 @@ def write_page(report: Report, traces: Sequence[Trace], path: Path) -> Path:
         traces: what it plays.
         path: of the file.
     """
+    curves = _curves(report)
+    body = _body(report, bool(curves)) if report.runs else ""
+    scripts = [get_plotlyjs()] if curves else []
+    html = page("saferl report", body, traces, scripts=scripts, curves=curves)
+    path.write_text(html, encoding="utf-8")
+    return path
+
+
+def _body(report: Report, curves: bool) -> str:
     parts = [f"<p>Runs: {escape(states(report.runs))}.</p>", _text(READING)]
     for table in report.tables:
         parts += [f"<h2>{escape(table.title)}</h2>", _table(table_grid(table))]
@@ -44,14 +53,9 @@ def write_page(report: Report, traces: Sequence[Trace], path: Path) -> Path:
         parts.append(_table(effort_grid(report.efforts, report.against)))
     parts += ["<h2>The paper's claims</h2>", _text(f"{CLAIMS} {verdicts(report.claims)}."), "<ul>"]
     parts += [f"<li>{_bold(sentence(claim))}</li>" for claim in report.claims] + ["</ul>"]
-    curves = _curves(report)
     if curves:
         parts += ["<h2>Learning curves</h2>", _text(CURVES), '<div id="curves"></div>']
-    parts += ["<h2>Runs</h2>", _table(run_grid(report.runs), words=5)]
-    scripts = [get_plotlyjs()] if curves else []
-    html = page("saferl report", "\n".join(parts), traces, scripts=scripts, curves=curves)
-    path.write_text(html, encoding="utf-8")
-    return path
+    return "\n".join([*parts, "<h2>Runs</h2>", _table(run_grid(report.runs), words=5)])
 
 
 def _text(text: str) -> str:

@@ -78,3 +78,11 @@ def test_a_trained_policys_crashes_are_explained(command, tmp_path: Path, capsys
     assert (
         not (tmp_path / "none/crashes.csv").exists() and not (tmp_path / f"none/{TRACE}").exists()
     )
+
+
+def test_a_trace_alone_is_played_without_a_run(command, tmp_path: Path, capsys):
+    command(*TEST, "policy=blind", "task=lt", "episodes=2", "trace=all", "out=alone")
+    capsys.readouterr()
+    main(["alone", "--out", "report"])
+    assert capsys.readouterr().out == "report/report.html\n"
+    assert [path.name for path in (tmp_path / "report").iterdir()] == ["report.html"]
