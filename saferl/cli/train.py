@@ -8,13 +8,13 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.transforms import Transform
 
 from saferl.algorithms.assemble import build_trainer, complete
+from saferl.algorithms.parts import make
 from saferl.checkpoint.lock import alone
 from saferl.checkpoint.run import CONFIG, begun, run_config, run_folder
 from saferl.cli.evaluate import compiling, measure, pictures, trained_policy
@@ -81,7 +81,7 @@ def train(cfg: DictConfig) -> None:
 def closing_test(cfg: DictConfig, run: Path) -> None:
     """Test what a run has learned, beside the scripted drivers that it names, and draw its first episodes."""
     settings = cfg.evaluation
-    task = hydra.utils.instantiate(cfg.task).as_test()
+    task = make(cfg.task).as_test()
     policy, transforms = trained_policy(cfg, run)
 
     def test(policy: TensorDictModuleBase, transforms: Sequence[Transform], name: str, out: Path):

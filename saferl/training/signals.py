@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from typing import Protocol, runtime_checkable
 
 from tensordict import TensorDictBase
 
@@ -13,6 +14,13 @@ from saferl.training.limit import EARLY
 from saferl.training.trainer import Trainer
 
 log = logging.getLogger(__name__)
+
+
+@runtime_checkable
+class Signal(Protocol):
+    """What moves a multiplier: it hangs itself into a trainer."""
+
+    def register(self, trainer: Trainer) -> None: ...
 
 
 class CriticSignal:
