@@ -45,7 +45,7 @@ class CriticSignal:
             raise ValueError(
                 f"loss.risk_limit must be lagrange.signal.risk_limit, got {limit:g} and {self.risk_limit:g}; set risk_limit."
             )
-        self._begin, self._told = float(self._lagrange.value), False
+        self._begin = float(self._lagrange.value)
         trainer.learner.after_update.append(self._update)
         trainer.after_collect.append(self._watch)
 
@@ -54,14 +54,13 @@ class CriticSignal:
 
     def _watch(self, finished: TensorDictBase, spent: float) -> None:
         """Say once that the limit limits nothing."""
-        if spent >= EARLY and self._trainer.progress.updates and not self._told:
-            self._told = True
-            if float(self._lagrange.value) <= self._begin:
-                log.warning(
-                    "risk_limit=%g has limited nothing so far: the multiplier, %.4g, has not risen.",
-                    self.risk_limit,
-                    float(self._lagrange.value),
-                )
+        due = spent >= EARLY and self._trainer.progress.updates
+        if due and self._trainer.watch.first("risk") and self._lagrange.value <= self._begin:
+            log.warning(
+                "risk_limit=%g has limited nothing so far: the multiplier, %.4g, has not risen.",
+                self.risk_limit,
+                float(self._lagrange.value),
+            )
 
 
 class EpisodeSignal:
