@@ -130,24 +130,31 @@ def _check_kind(node: DictConfig, path: str, kind: Any) -> None:
 def _suits(found: Any, naming: bool, kind: Any) -> bool:
     """Whether what is named (``naming``), or what it makes, may be of a kind; what is not known may be of any."""
     if get_origin(kind) is type:
-        return naming and inspect.isclass(found) and issubclass(found, get_args(kind))
+        return naming and inspect.isclass(found) and _below(found, get_args(kind)[0])
     if not inspect.isclass(kind) or kind in (Any, inspect.Parameter.empty):
         return True
     if not inspect.isclass(found):
         with suppress(Exception):  # a builtin has no annotations
             found = get_type_hints(found).get("return")
-    return not naming and (not inspect.isclass(found) or issubclass(found, kind))
+    return not naming and (not inspect.isclass(found) or _below(found, kind))
+
+
+def _below(found: type, kind: Any) -> bool:
+    try:
+        return issubclass(found, kind)
+    except TypeError:  # a protocol whose members are not methods, and other kinds that cannot tell
+        return True
 
 
 def described(kind: Any) -> str:
     """What a name must stand for, in words.
 
     >>> described(Task), described(type[Task])
-    ('what makes a Task', 'a class of Task')
+    ('a kind of Task', 'a subclass of Task')
     """
     if get_origin(kind) is type:
-        return f"a class of {get_args(kind)[0].__name__}"
-    return f"what makes a {kind.__name__}" if inspect.isclass(kind) else describe(kind)
+        return f"a subclass of {get_args(kind)[0].__name__}"
+    return f"a kind of {kind.__name__}" if inspect.isclass(kind) else describe(kind)
 
 
 def _object(name: Any, key: str) -> Any:
