@@ -54,6 +54,8 @@ def run(tmp_path_factory) -> Path:
         ["two_checkouts", ".", "--runs", "algo=sac encoder.width=16", "--modes", "eager", "--batch", "8",
          *SHORT],
         ["reward_audit", "--episodes", "4"],
+        ["soak", "--decisions", "640", "--updates", "20", "--num-envs", "16", "--set", "env.compile_physics=false",
+         "evaluation.episodes=1"],
         ["mmam_forms", "--seeds", "0", "--updates", "20", "--width", "16"],
     ],
     ids=lambda arguments: arguments[0],

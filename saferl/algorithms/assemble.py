@@ -73,7 +73,7 @@ def complete(node: DictConfig) -> None:
             f"shaping changes the road's reward, which task={node.task} has not: set shaping=none."
         )
     check_targets(node, "task")
-    node.merge_with(hydra.utils.instantiate(node).complete())
+    node.merge_with(make(node).complete())
 
 
 def build_loggers(sinks: Sequence[DictConfig], run: Path) -> list:
@@ -94,7 +94,7 @@ def build_loggers(sinks: Sequence[DictConfig], run: Path) -> list:
 
 def algorithm_of(learning: DictConfig) -> Algorithm:
     """An algorithm of its family, from a node of the group ``learning``."""
-    return hydra.utils.instantiate(learning, _convert_="all")
+    return make(learning, {"_convert_": "all"})
 
 
 def build_agent(cfg: DictConfig) -> Agent:
@@ -132,6 +132,7 @@ def begin_from(agent: Agent, architecture: Mapping[str, Any], path: Path, device
         ValueError: another architecture; names the options that differ.
     """
     found, other = latest(path, "init"), run_config(path, "init")
+    check_targets(other)
     other.device = device
     theirs = algorithm_of(other.learning).architecture(Parts.of(other))
     differing = {
@@ -208,7 +209,7 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         open_loggers=partial(build_loggers, cfg.logger.sinks, run),
     )
     if cfg.lagrange.signal._target_ is not None:
-        hydra.utils.instantiate(cfg.lagrange.signal).register(trainer)
+        make(cfg.lagrange.signal).register(trainer)
     if agent.projector is not None and hasattr(agent.projector, "set_progress"):
         ProjectorProgress(agent.projector).register(trainer)
     return trainer

@@ -190,7 +190,7 @@ class Algorithm(ABC):
             **self.loss_parts(networks),
             "num_qvalue_nets": lambda: parts.critic.members,
             "num_cost_critics": lambda: parts.cost_critic.members,
-            "lagrange": lambda: hydra.utils.instantiate(parts.lagrange.multiplier),
+            "lagrange": lambda: make(parts.lagrange.multiplier),
         }
         built = {name: part() for name, part in settings.items() if name in takes}
         loss = make(parts.loss, **built).to(parts.device)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import hydra
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 
-from saferl.algorithms.parts import Parts, offered
+from saferl.algorithms.parts import Parts, make, offered
 from saferl.modules import Encoder, tanh_gaussian_actor, value_operator, zero_output
 
 #: Options of a critic of action values, and what they are where nothing is said.
@@ -26,7 +25,7 @@ class NetworkBuilder:
     def __init__(self, parts: Parts):
         self.parts = parts
         node = parts.encoder
-        self.encoder: Encoder = hydra.utils.instantiate(node, **offered(node, parts.task))
+        self.encoder: Encoder = make(node, offered(node, parts.task))
         self.observed: list[str] = []
 
     def reads(self, network: Any) -> tuple[str, ...]:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import hydra
 import torch
 from omegaconf import DictConfig
 
-from saferl.config.check import arguments
+from saferl.config.check import arguments, described, part
 from saferl.envs.task import Task
 
 
@@ -37,13 +38,24 @@ def make(node: DictConfig, settings: Mapping[str, Any] | None = None, **objects:
         **objects: arguments that the node may not set.
 
     Raises:
-        ValueError: the node sets what the composition gives.
+        ValueError: the node sets what the composition gives, does not take it, or makes no such part.
     """
-    for key in set(node) & set(objects):
-        raise ValueError(
-            f"{node._get_full_key(key)} cannot be set: it follows from the rest of the configuration."
-        )
-    return hydra.utils.instantiate(node, _partial_=True, **(settings or {}))(**objects)
+    name, takes = str(node._get_full_key(None)), arguments(node._target_)
+    for key in objects:
+        if key in node:
+            raise ValueError(
+                f"{name}.{key} cannot be set: it follows from the rest of the configuration."
+            )
+        if takes is not None and key not in takes:
+            raise ValueError(
+                f"{name}: {node._target_} takes no {key}, which the composition gives."
+            )
+    build = partial(hydra.utils.instantiate, node, **(settings or {}))
+    made = build(_partial_=True)(**objects) if objects else build()
+    kind = part(name)
+    if kind is not None and not isinstance(made, kind):
+        raise ValueError(f"{name}._target_ must name {described(kind)}, got {node._target_!r}.")
+    return made
 
 
 def offered(node: DictConfig, task: Task) -> dict[str, Any]:
@@ -83,7 +95,7 @@ class Parts:
         """The parts of a run's configuration."""
         groups = ("encoder", "critic", "cost_critic", "risk", "loss", "lagrange", "projector")
         return cls(
-            task=hydra.utils.instantiate(cfg.task),
+            task=make(cfg.task),
             gamma=cfg.gamma,
             device=device_of(cfg.device),
             **{group: cfg[group] for group in groups},

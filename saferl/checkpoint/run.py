@@ -6,7 +6,9 @@ they lie, and takes single ones out of them.
 
 from __future__ import annotations
 
+import os
 import shutil
+import weakref
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -45,17 +47,31 @@ class RunCheckpoint:
         self.run = run
         self.checkpoint = sealed(**components, rng=GlobalRNGState())
         self.rotation = CheckpointRotation(run / FOLDER, keep_last=keep)
+        self._opened: int | None = None
 
     def save(self, frames: int, metadata: dict[str, Any]) -> Path:
         """Write atomically; an interrupted write leaves the previous checkpoint whole.
 
         Raises:
-            OSError: it cannot be written, for lack of room perhaps.
+            OSError: it cannot be written, for lack of room perhaps; or the run's folder is no longer that of the first save.
         """
+        self._check_folder()
         try:
-            return self.rotation.save(self.checkpoint, step=frames, metadata=metadata)
-        except RuntimeError as error:  # as torch calls it where a file cannot grow
+            path = self.rotation.save(self.checkpoint, step=frames, metadata=metadata)
+        except (RuntimeError, OSError) as error:  # torch's, where a file cannot grow, and Python's
+            self._check_folder()
             raise OSError(f"the checkpoint of frame {frames} cannot be written: {error}") from error
+        self._check_folder()
+        return path
+
+    def _check_folder(self) -> None:
+        """Refuse to go on in a folder that took the place of the run's own, which would lack all but a checkpoint."""
+        if self._opened is None:  # while it is open, no other folder has its number
+            self.run.mkdir(parents=True, exist_ok=True)
+            self._opened = os.open(self.run, os.O_RDONLY)
+            weakref.finalize(self, os.close, self._opened)
+        if not self.run.exists() or not os.path.samestat(os.fstat(self._opened), self.run.stat()):
+            raise FileNotFoundError(f"{self.run} was moved or deleted while the run wrote to it.")
 
     def load_latest(self) -> Path:
         """Restore every component from the newest checkpoint, and clear away unfinished ones.

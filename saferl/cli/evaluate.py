@@ -13,7 +13,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import hydra
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
@@ -21,7 +20,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.transforms import Transform
 
 from saferl.algorithms.assemble import build_env
-from saferl.algorithms.parts import device_of, offered
+from saferl.algorithms.parts import device_of, make, offered
 from saferl.algorithms.policy import trained_agent
 from saferl.checkpoint.run import run_config
 from saferl.cli.launch import job_folder
@@ -223,7 +222,7 @@ def on_its_own_task(cfg: DictConfig, trained: DictConfig, overrides: Sequence[st
     OmegaConf.set_struct(test.task, False)
     for key, value in said.items():  # what a test changes may follow from it
         OmegaConf.update(test, key, value)
-    test.task.merge_with(hydra.utils.instantiate(test.task).in_tests)
+    test.task.merge_with(make(test.task).in_tests)
     if "env" not in keys:
         # The backend is the run's; what the backends set alike, or this one sets too, is the test's.
         shared = {k: v for k, v in cfg.env.items() if k in trained.env and k != "_target_"}
@@ -254,13 +253,14 @@ def choose_policy(
     overrides = HydraConfig.get().overrides.task
     if source == "policy":
         cfg = on_its_own_task(cfg, cfg, overrides)
-        task = hydra.utils.instantiate(cfg.task)
+        task = make(cfg.task)
         return cfg, task, Candidate(name, task.driver(name, cfg.seed))
     path = pretrained_run(name) if source == "pretrained" else Path(name)
     trained = run_config(path, source)
+    check_targets(trained)
     trained.device = cfg.device
     cfg = on_its_own_task(cfg, trained, overrides)
-    task, learned = hydra.utils.instantiate(cfg.task), hydra.utils.instantiate(trained.task)
+    task, learned = make(cfg.task), make(trained.task)
     task.check_policy_of(learned)
     for key, value in offered(trained.encoder, learned).items():
         if task.network[key] != value:

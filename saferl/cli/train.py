@@ -8,11 +8,11 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from saferl.algorithms.assemble import build_trainer, complete
+from saferl.algorithms.parts import make
 from saferl.checkpoint.lock import alone
 from saferl.checkpoint.run import CONFIG, begun, run_config, run_folder
 from saferl.cli.evaluate import Candidate, compiling, drawn, measure, pictures
@@ -80,7 +80,7 @@ def train(cfg: DictConfig) -> None:
 def closing_test(cfg: DictConfig, run: Path) -> None:
     """Test what a run has learned, beside the scripted drivers that it names, and draw episodes of it."""
     settings = cfg.evaluation
-    task = hydra.utils.instantiate(cfg.task).as_test()
+    task = make(cfg.task).as_test()
     mine = Candidate.trained(cfg.algo_name, cfg, run)
     drivers = [Candidate(name, task.driver(name, cfg.seed)) for name in settings.drivers]
     out, results = run / "evaluation", {}

@@ -14,10 +14,24 @@ import hydra
 from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
 
 from saferl.config import schema
+from saferl.config.foreign import NAMING
 from saferl.envs.task import Task
 
 _KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
 _KINDS |= {NoneType: "null"}
+
+#: What the parts of a composition must be, by their places. A risk is any function: the loss tries it.
+PARTS = {
+    "task": "saferl.envs.task.Task",
+    "env": "torchrl.envs.EnvBase",
+    "encoder": "saferl.modules.Encoder",
+    "learning": "saferl.algorithms.Algorithm",
+    "loss": "torchrl.objectives.LossModule",
+    "lagrange.multiplier": "saferl.modules.LagrangeMultiplier",
+    "lagrange.signal": "saferl.training.signals.Signal",
+    "projector": "torchrl.envs.Transform",
+    "logger.sinks": "torchrl.record.loggers.Logger",
+}
 
 
 def check(cfg: DictConfig) -> None:
@@ -61,8 +75,8 @@ def check_task(evaluation: Any, task: Task) -> None:
 
 
 def check_targets(node: Any, path: str = "", kind: Any = None) -> None:
-    """Check each ``_target_`` below a node against its signature (names and kinds of arguments), each
-    mapping that stands for a dataclass (``kind``) against its fields, and that every number is finite.
+    """Check that each ``_target_`` below a node makes what its place needs (``kind``), and its arguments, by names and
+    kinds; each mapping that stands for a dataclass against its fields; and that every number is finite.
 
     Raises:
         ValueError: names the key and what is allowed.
@@ -74,8 +88,10 @@ def check_targets(node: Any, path: str = "", kind: Any = None) -> None:
             check_targets(item, f"{path}[{index}]")
     if not isinstance(node, DictConfig):
         return
-    target = node.get("_target_")
-    accepted = None if target is None else arguments(target)
+    target, accepted = node.get("_target_"), None
+    if target is not None:
+        _check_kind(node, path, kind or part(path))
+        accepted = arguments(target)
     if target is None and is_dataclass(kind):
         target, accepted = f"{path}, a {kind.__name__},", get_type_hints(kind)  # pyright: ignore
     for key in _required(node.get("_target_")):
@@ -93,6 +109,66 @@ def check_targets(node: Any, path: str = "", kind: Any = None) -> None:
         check_targets(value, name, (accepted or {}).get(str(key)))
 
 
+def part(path: str) -> type | None:
+    """What the part at this place of a composition must be; None where it is none."""
+    place = path.partition("[")[0]
+    return hydra.utils.get_object(PARTS[place]) if place in PARTS else None
+
+
+def _check_kind(node: DictConfig, path: str, kind: Any) -> None:
+    """Refuse a ``_target_`` that makes something else than its place needs, as far as that is known before."""
+    naming = node._target_ in NAMING
+    key = "path" if naming else "_target_"
+    if key not in node:
+        raise ValueError(f"{path}.path is missing: {node._target_} has no default for it.")
+    found = _object(node[key], f"{path}.{key}")
+    options = get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
+    if not any(_suits(found, naming, option) for option in options):
+        raise ValueError(f"{path}.{key} must name {described(kind)}, got {node[key]!r}.")
+
+
+def _suits(found: Any, naming: bool, kind: Any) -> bool:
+    """Whether what is named (``naming``), or what it makes, may be of a kind; what is not known may be of any."""
+    if get_origin(kind) is type:
+        return naming and inspect.isclass(found) and _below(found, get_args(kind)[0])
+    if not inspect.isclass(kind) or kind in (Any, inspect.Parameter.empty):
+        return True
+    if not inspect.isclass(found):
+        with suppress(Exception):  # a builtin has no annotations
+            found = get_type_hints(found).get("return")
+    return not naming and (not inspect.isclass(found) or _below(found, kind))
+
+
+def _below(found: type, kind: Any) -> bool:
+    try:
+        return issubclass(found, kind)
+    except TypeError:  # a protocol whose members are not methods, and other kinds that cannot tell
+        return True
+
+
+def described(kind: Any) -> str:
+    """What a name must stand for, in words.
+
+    >>> described(Task), described(type[Task])
+    ('a kind of Task', 'a subclass of Task')
+    """
+    if get_origin(kind) is type:
+        return f"a subclass of {get_args(kind)[0].__name__}"
+    return f"a kind of {kind.__name__}" if inspect.isclass(kind) else describe(kind)
+
+
+def _object(name: Any, key: str) -> Any:
+    """What a dotted name stands for.
+
+    Raises:
+        ValueError: nothing; calls it ``key``.
+    """
+    try:
+        return hydra.utils.get_object(name)
+    except Exception as error:
+        raise ValueError(f"{key} names nothing that can be imported: {name!r}.") from error
+
+
 def _required(target: str | None) -> list[str]:
     """The settings that a dataclass named by a ``_target_`` leaves to the configuration."""
     kind = None if target is None else hydra.utils.get_object(target)
@@ -107,10 +183,7 @@ def arguments(target: str) -> dict[str, Any] | None:
     Raises:
         ValueError: there is no such class or function.
     """
-    try:
-        function: Any = hydra.utils.get_object(target)
-    except Exception as error:
-        raise ValueError(f"_target_ names nothing that can be imported: {target!r}.") from error
+    function: Any = _object(target, "_target_")
     kinds: dict[str, Any] = {}
     if is_dataclass(function):  # whose fields may come from other modules
         with suppress(NameError):

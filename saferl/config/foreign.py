@@ -18,7 +18,7 @@ _PARTS = re.compile(
     r"|torchrl\.(?:objectives|modules|record\.loggers)|torch\.nn)\.[A-Z]\w*"
 )
 #: By which a file names a class or a function, its ``path``.
-_NAMING = ("hydra.utils.get_class", "hydra.utils.get_method")
+NAMING = ("hydra.utils.get_class", "hydra.utils.get_method")
 #: What a node may say to Hydra; positional arguments would not be looked at.
 _HYDRAS = ("_target_", "_convert_", "_partial_", "_recursive_")
 #: What folders are called by.
@@ -50,7 +50,7 @@ def check_origin(settings: Any, path: Path) -> None:
                 f"{path}: {name} may not be set by a file, as {unknown[0]} is not known."
             )
         if value is not None and ("_target_" in keys or key == "path"):
-            naming = key == "_target_" and value in _NAMING
+            naming = key == "_target_" and value in NAMING
             if (
                 not naming
                 and not _PARTS.fullmatch(str(value))

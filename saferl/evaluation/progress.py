@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from typing import Any, TextIO
 
 from tqdm import tqdm
 
 
 class _Lines:
-    """A stream on which each state of a bar is a line of its own."""
+    """A stream on which each state of a bar is a line of its own; one that takes no more ends nobody's run."""
 
     def __init__(self, stream: TextIO):
         self.stream = stream
 
     def write(self, text: str) -> None:
         if line := text.strip():
-            self.stream.write(f"{line}\n")
+            with suppress(OSError):
+                self.stream.write(f"{line}\n")
 
     def flush(self) -> None:
-        self.stream.flush()
+        with suppress(OSError):
+            self.stream.flush()
 
 
 def bar(**options: Any) -> tqdm:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +10,7 @@ from torch import nn
 
 
 @dataclass(frozen=True)
-class Encoder:
+class Encoder(ABC):
     """Settings from which an algorithm makes all its networks: one choice of ``conf/encoder``.
 
     A subclass is a dataclass with the settings of both networks as its fields. It gets what the task knows of its
@@ -21,20 +22,20 @@ class Encoder:
 
     width: int
 
+    @abstractmethod
     def policy(self) -> nn.Module:
         """A network of the features [*B, width] that a policy, or the value of a state, reads.
 
         Its ``in_keys`` are what it observes.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def value(self, **options: Any) -> nn.Module:
         """A network of an action's value [*B, outputs], from what it observes (``in_keys``) and the action.
 
         Args:
             **options: ``outputs`` and ``layer_norm``, where a group of critics asks for others than 1 and false.
         """
-        raise NotImplementedError
 
     def settings(self, *without: str) -> dict[str, Any]:
         """All fields by name, except the ones given."""

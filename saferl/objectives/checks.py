@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, get_args
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
+from torch import Tensor
 
 from saferl.modules import LagrangeMultiplier
 
@@ -80,6 +83,25 @@ def check_lagrange(lagrange: Any) -> LagrangeMultiplier:
     if not isinstance(lagrange, LagrangeMultiplier):
         raise ValueError(f"lagrange must be a LagrangeMultiplier, got {lagrange!r}.")
     return lagrange
+
+
+def check_risk(risk: Any) -> Callable[[Tensor], Tensor]:
+    """What makes a risk [*B, 1] of the members' values [n, *B, K], by trying it.
+
+    Raises:
+        ValueError: it is no function, or makes something else.
+    """
+    try:
+        shape = tuple(risk(torch.zeros(2, 3, 1)).shape)
+    except Exception as error:
+        raise ValueError(
+            f"risk must be a function of values [n, *B, K], such as saferl.modules.Largest(), got {risk!r}."
+        ) from error
+    if shape != (3, 1):
+        raise ValueError(
+            f"risk must make [3, 1] of values [2, 3, 1], got {list(shape)} of {risk!r}."
+        )
+    return risk
 
 
 def count_members(name: str, members: Any, number: str, count: int | None) -> int:

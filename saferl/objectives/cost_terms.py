@@ -25,6 +25,7 @@ from saferl.objectives.checks import (
     check_cost,
     check_lagrange,
     check_limit,
+    check_risk,
     count_members,
 )
 
@@ -128,7 +129,7 @@ class CostCriticMixin(LossMixin):
         )
         self.cost_target = check_choice("cost_target", cost_target, CostTarget)
         self.cost_backup = check_choice("cost_backup", cost_backup, CostBackup)
-        self.risk = risk or Largest()
+        self.risk = check_risk(Largest() if risk is None else risk)
         self.convert_to_functional(
             cost_critic,  # pyright: ignore[reportArgumentType]
             "cost_critic",
@@ -136,10 +137,6 @@ class CostCriticMixin(LossMixin):
             create_target_params=create_target_params,
             compare_against=compare_against,
         )
-        if not callable(self.risk):
-            raise ValueError(
-                f"risk must be a function, such as saferl.modules.Largest(), got {risk!r}."
-            )
         self.lagrange = check_lagrange(lagrange)
         self.register_coeff_buffer("risk_limit", risk_limit, device=self.buffer_device)
         # Asked for now, so that a fresh loss loads a state_dict strictly.

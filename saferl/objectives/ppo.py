@@ -15,7 +15,7 @@ from torchrl.objectives.utils import distance_loss
 
 from saferl.modules import BoundCritics, CriticEnsemble, LagrangeMultiplier, Largest
 from saferl.objectives.advantages import CostValueKeys, CostValueMixin
-from saferl.objectives.checks import check_begun, check_lagrange
+from saferl.objectives.checks import check_begun, check_lagrange, check_risk
 from saferl.objectives.cost_terms import quantile_loss
 
 
@@ -249,7 +249,7 @@ class RiskPPOLoss(PPOLagLoss):
             separate_losses=separate_losses,
             reduction=reduction,
         )
-        self.risk = risk or Largest()
+        self.risk = check_risk(Largest() if risk is None else risk)
         self.convert_to_functional(risk_critic, "risk_critic", len(risk_critic))  # pyright: ignore
         self.out_keys = [*self.out_keys, "loss_risk"]
 

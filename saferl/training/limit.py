@@ -16,7 +16,8 @@ EARLY = 0.1
 
 
 class CostWatch:
-    """Says when a limit is met, that it limits nothing, and at the end whether it is kept; once each.
+    """Says when a limit is met, that it limits nothing, and at the end whether it is kept; once each, however often a run
+    is resumed.
 
     Args:
         limit: ``cost_limit``, undiscounted; None: there is none, and nothing is said.
@@ -25,14 +26,27 @@ class CostWatch:
 
     def __init__(self, limit: float | None = None, window: int = 200):
         self.limit, self.window = limit, window
-        self.dearest, self.bound, self.met, self.idle = 0.0, False, False, False
+        self.dearest, self.bound = 0.0, False
+        self.said: list[str] = []
 
     def state_dict(self) -> dict[str, Any]:
         """What was seen and said so far."""
-        return {name: getattr(self, name) for name in ("dearest", "bound", "met", "idle")}
+        return {"dearest": self.dearest, "bound": self.bound, "said": [*self.said]}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
+
+    def first(self, what: str) -> bool:
+        """Whether a run comes to say something for the first time.
+
+        >>> watch = CostWatch()
+        >>> watch.first("it is met"), watch.first("it is met")
+        (True, False)
+        """
+        if what in self.said:
+            return False
+        self.said.append(what)
+        return True
 
     def take(self, costs: Tensor) -> None:
         """Take the costs [n] of the episodes that have just ended."""
@@ -51,15 +65,14 @@ class CostWatch:
         if self.limit is None or costs is None or not len(costs):
             return
         mean = float(costs.mean())
-        if not self.bound and not self.idle and spent >= EARLY:
-            self.idle = True
+        if not self.bound and spent >= EARLY and self.first("idle"):
             log.warning(
                 "cost_limit=%g has limited nothing so far: no episode cost more than %.4g.",
                 self.limit,
                 self.dearest,
             )
-        if self.bound and not self.met and mean <= self.limit and len(costs) >= self.window:
-            self.met = True
+        kept = self.bound and mean <= self.limit and len(costs) >= self.window
+        if kept and self.first("met"):
             log.info(
                 "cost_limit=%g is met at frame %d: the last %d episodes cost %.4g in the mean.",
                 self.limit,

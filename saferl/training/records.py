@@ -107,7 +107,18 @@ class CsvLog:
             return [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(file)]
 
     def write(self, row: dict[str, float]) -> None:
-        """Append a row (keys are column names)."""
+        """Append a row (keys are column names).
+
+        Raises:
+            OSError: there is no room for it; names the file.
+        """
+        try:
+            self._write(row)
+        except OSError as error:
+            error.filename = str(self.path)  # which a write does not know
+            raise
+
+    def _write(self, row: dict[str, float]) -> None:
         rows, columns = [], []
         if self.path.exists():
             with self.path.open(newline="") as file:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from typing import Protocol, runtime_checkable
 
 from tensordict import TensorDictBase
 
@@ -13,6 +14,13 @@ from saferl.training.limit import EARLY
 from saferl.training.trainer import Trainer
 
 log = logging.getLogger(__name__)
+
+
+@runtime_checkable
+class Signal(Protocol):
+    """What moves a multiplier: it hangs itself into a trainer."""
+
+    def register(self, trainer: Trainer) -> None: ...
 
 
 class CriticSignal:
@@ -37,7 +45,7 @@ class CriticSignal:
             raise ValueError(
                 f"loss.risk_limit must be lagrange.signal.risk_limit, got {limit:g} and {self.risk_limit:g}; set risk_limit."
             )
-        self._begin, self._told = float(self._lagrange.value), False
+        self._begin = float(self._lagrange.value)
         trainer.learner.after_update.append(self._update)
         trainer.after_collect.append(self._watch)
 
@@ -46,14 +54,13 @@ class CriticSignal:
 
     def _watch(self, finished: TensorDictBase, spent: float) -> None:
         """Say once that the limit limits nothing."""
-        if spent >= EARLY and self._trainer.progress.updates and not self._told:
-            self._told = True
-            if float(self._lagrange.value) <= self._begin:
-                log.warning(
-                    "risk_limit=%g has limited nothing so far: the multiplier, %.4g, has not risen.",
-                    self.risk_limit,
-                    float(self._lagrange.value),
-                )
+        due = spent >= EARLY and self._trainer.progress.updates
+        if due and self._trainer.watch.first("risk") and self._lagrange.value <= self._begin:
+            log.warning(
+                "risk_limit=%g has limited nothing so far: the multiplier, %.4g, has not risen.",
+                self.risk_limit,
+                float(self._lagrange.value),
+            )
 
 
 class EpisodeSignal:

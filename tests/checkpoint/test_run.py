@@ -106,6 +106,36 @@ def test_a_failed_write_leaves_the_last_checkpoint(tmp_path: Path):
     assert part.loaded["value"] == 1.0 and not leftover.exists()
 
 
+@pytest.mark.parametrize("how", ["moved", "deleted", "deleted in a save", "replaced"])
+def test_a_folder_that_is_gone_is_not_begun_anew(how: str, tmp_path: Path):
+    """It would hold a checkpoint, and nothing else of the run."""
+    run = tmp_path / "run"
+
+    class Part:
+        deletes = False
+
+        def state_dict(self):
+            if self.deletes:
+                shutil.rmtree(run)
+            return {"value": torch.tensor(1.0)}
+
+    part = Part()
+    checkpoint = RunCheckpoint(run, part=part)
+    checkpoint.save(1, {})
+    if how == "moved":
+        run.rename(tmp_path / "elsewhere")
+    elif how == "deleted in a save":
+        part.deletes = True
+    else:
+        shutil.rmtree(run)
+    if how == "replaced":
+        run.mkdir()
+    with pytest.raises(
+        FileNotFoundError, match="run was moved or deleted while the run wrote to it"
+    ):
+        checkpoint.save(2, {})
+
+
 def test_the_newest_replaces_the_older(tmp_path: Path):
     checkpoint = RunCheckpoint(tmp_path, part=GrowingFiles())
     for frames in (5, 10):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import math
 import re
 from pathlib import Path
@@ -129,3 +130,12 @@ def test_csv_takes_late_columns(tmp_path: Path):
     assert rows == [{"a": "1", "b": ""}, {"a": "2", "b": "3"}, {"a": "", "b": "4"}]
     assert log.read() == [{"a": 1.0}, {"a": 2.0, "b": 3.0}, {"b": 4.0}]
     assert CsvLog(tmp_path / "none.csv").read() == []
+
+
+def test_a_log_without_room_is_named(tmp_path: Path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(CsvLog, "_write", full)
+    with pytest.raises(OSError, match=r"No space left on device: .*log\.csv"):
+        CsvLog(tmp_path / "log.csv").write({"a": 1.0})

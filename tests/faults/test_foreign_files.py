@@ -115,3 +115,15 @@ def test_ones_own_parts_may_be_named(theirs: Path, tmp_path: Path, monkeypatch: 
     monkeypatch.delenv("SAFERL_TRUST")
     with pytest.raises(ValueError, match="SAFERL_TRUST=package"):
         run_config(tmp_path / "run")
+
+
+@pytest.mark.parametrize("option", ["checkpoint", "init", "resume"])
+def test_a_part_of_another_kind_is_told(option: str, theirs: Path, tmp_path: Path, refusal):
+    shutil.copytree(theirs, tmp_path / "run")
+    cfg = OmegaConf.load(tmp_path / "run" / CONFIG)
+    OmegaConf.update(cfg, "encoder", {"_target_": "saferl.modules.CVaR"}, merge=False)
+    OmegaConf.save(cfg, tmp_path / "run" / CONFIG)
+    command = ("evaluate", "evaluate") if option == "checkpoint" else ("train", "config")
+    options = () if option != "init" else (*SMALL, "algo=rsac", "task=cart", "risk_limit=1")
+    line = refusal(*command, *options, f"{option}=run")
+    assert line.startswith("error: encoder._target_ must name a kind of Encoder, got ")

@@ -24,7 +24,8 @@ from saferl.config.flat import flat
 FEW = (*SMALL, "task.vehicles=1", "task.duration=2")
 CHOSEN = {group: sorted(options(group)) for group in GROUPS}
 #: What takes minutes, needs a package that may be missing, or another's service.
-LONG = {("experiment", "speed"), ("logger", "wandb"), ("task", "gym"), ("env", "gym")}
+LONG = {("experiment", name) for name in ("speed", "paper_ablation", "paper_comparison")}
+LONG |= {("logger", "wandb"), ("task", "gym"), ("env", "gym")}
 EDGES = [
     "0",
     "1",
@@ -81,7 +82,7 @@ LINES = st.lists(st.one_of(CHOICES, SETTINGS), min_size=1, max_size=4)
 def run(line: list[str]) -> None:
     here, argv, folder = Path.cwd(), sys.argv, Path(tempfile.mkdtemp())
     os.chdir(folder)
-    arguments = [*FEW, "cost_limit=1", *line]
+    arguments = [*FEW, *line]
     experiment = [each for each in line if each.startswith("experiment=")]
     if experiment:
         arguments.append("episodes=null" if "frames" not in line else "")

@@ -226,7 +226,7 @@ def test_the_command(report, capsys, monkeypatch):
     for arguments, line in (
         ([folder, "--against", "scripted"], "--against must be among cpo, "),
         ([f"{folder}/nowhere"], "no such folder"),
-        ([str(out)], "no run below"),
+        ([str(out)], "no run and no trace below"),
         ([folder, "--out", str(out / "report.md")], ".*File exists"),
     ):
         with pytest.raises(SystemExit, match=f"^error: {line}"):

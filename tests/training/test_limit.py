@@ -73,6 +73,20 @@ def test_a_limit_of_the_risk_that_limits_nothing(tmp_path: Path, caplog):
     assert not [m for m in messages if "limited nothing" in m]
 
 
+def test_a_resumed_run_does_not_repeat_itself(tmp_path: Path, caplog):
+    """Neither of what an episode costs nor of the risk in a state."""
+    options = ("algo=arsac", "risk_limit=1000", "frames=100", "task.duration=1")
+    trainer = trainer_of(tmp_path, *options)
+    trainer.save()
+    messages = told(caplog, lambda: collect(trainer, 20))
+    for limit in ("risk_limit=1000", "cost_limit=0.1"):
+        assert len([m for m in messages if m.startswith(f"{limit} has limited nothing")]) == 1
+    trainer.save()
+    resumed = trainer_of(tmp_path, *options)
+    resumed.resume()
+    assert not [m for m in told(caplog, lambda: collect(resumed, 5)) if "limited nothing" in m]
+
+
 def test_the_limit_stands_beside_the_cost(tmp_path: Path):
     trainer = trainer_of(tmp_path, "algo=sac_lag", "cost_limit=0.25", "task.duration=1")
     collect(trainer, 20)

@@ -19,6 +19,7 @@ from matplotlib.patches import Circle, Rectangle
 from matplotlib.path import Path as Outline
 from matplotlib.patheffects import withStroke
 from matplotlib.textpath import TextPath
+from matplotlib.typing import RGBAColorType
 
 from saferl.envs.intersection.episode import Episode
 from saferl.envs.intersection.geometry import (
@@ -121,12 +122,12 @@ class Shape(NamedTuple):
     """A part of a picture of a car."""
 
     outline: Outline
-    face: tuple[float, ...]
-    edge: tuple[float, ...]
+    face: RGBAColorType
+    edge: RGBAColorType
     width: float
 
 
-_NONE = (0.0, 0.0, 0.0, 0.0)
+_NONE: RGBAColorType = (0.0, 0.0, 0.0, 0.0)
 
 
 def car(
@@ -163,11 +164,11 @@ def draw_cars(axes: Axes, shapes: Iterable[Shape], zorder: float = 4.0) -> PathC
 
 def show(drawn: PathCollection, shapes: Iterable[Shape]) -> None:
     """Let an artist of :func:`draw_cars` show these in place of what it showed."""
-    outlines, faces, edges, widths = (
-        zip(*shapes, strict=True) if (shapes := [*shapes]) else [()] * 4
-    )
-    drawn.set_paths(outlines)
-    drawn.set(facecolor=faces, edgecolor=edges, linewidth=widths or (0,))
+    shapes = [*shapes]
+    drawn.set_paths([shape.outline for shape in shapes])
+    drawn.set_facecolor([shape.face for shape in shapes])
+    drawn.set_edgecolor([shape.edge for shape in shapes])
+    drawn.set_linewidth([shape.width for shape in shapes] or [0.0])
 
 
 def draw_star(axes: Axes, x: float, y: float, size: float = 160) -> PathCollection:
