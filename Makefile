@@ -5,7 +5,7 @@ STAMP := $(VENV)/.installed
 # One thread for each process: two that fight over the cores are slower than one.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: setup train test slow lint docs gpu generalisation
+.PHONY: setup train demo test slow lint docs gpu generalisation
 
 setup: $(STAMP)
 
@@ -17,6 +17,13 @@ $(STAMP): pyproject.toml constraints.txt
 
 train: setup
 	$(BIN)/python -m saferl experiment=quickstart
+
+# The agent that ships beside the blind driver in the same 50 episodes, and a page that plays them.
+demo: setup
+	rm -rf build/demo
+	$(BIN)/python -m saferl.evaluate pretrained=arsac task=mixed episodes=50 trace=all why=true out=build/demo/arsac
+	$(BIN)/python -m saferl.evaluate policy=blind task=mixed episodes=50 trace=all why=true out=build/demo/blind
+	$(BIN)/python -m saferl.report build/demo --out build/demo
 
 test: setup
 	$(BIN)/python -m pytest -n 2 -q

@@ -23,6 +23,7 @@ from saferl.config import schema
 from saferl.config.catalog import main as catalog
 from saferl.config.check import check
 from saferl.evaluation.compare import main as summary
+from saferl.report.command import main as report
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -38,7 +39,7 @@ FEWER = {
 
 
 #: Commands that print a table.
-TABLES = {"catalog": catalog, "summary": summary}
+TABLES = {"catalog": catalog, "summary": summary, "report": report}
 
 
 class Built:
@@ -144,7 +145,7 @@ def smaller(door: str, arguments: list[str]) -> list[str]:
     names = {argument.partition("=")[0] for argument in arguments}
     fewer = next((FEWER[a] for a in arguments if a in FEWER), ())
     arguments += [each for each in fewer if each.partition("=")[0] not in names]
-    small = (*EMPTY, *(SMALL if door == "train" else ("episodes=2", "gif=0")))
+    small = (*EMPTY, *(SMALL if door == "train" else ("episodes=2", "draw=none")))
     other = any(re.match(r"task=(gym|cart|tank)", a) for a in arguments)
     kept = {"env", "task.vehicles"} if other else {"env"} & names
     small = tuple(a for a in small if a.partition("=")[0] not in kept)
@@ -184,7 +185,7 @@ def play(line: str, saferl: Callable[..., None], later: str | None = None) -> No
             saferl(module, *arguments, later=later)
         case ["python", script, *arguments]:
             check_script(script, *arguments)
-        case ["make", target]:
+        case ["make", target, *_]:
             assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), re.MULTILINE)
         case ["pip", "install", package]:
             assert re.fullmatch(r"saferl\[(\w+)\]", package)[1] in extras()  # pyright: ignore

@@ -13,7 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from saferl.algorithms.assemble import load_agent
 from saferl.algorithms.base import Agent
 from saferl.checkpoint.run import progress, run_config
-from saferl.config.locate import pretrained_run
+from saferl.config.locate import pretrained_run, shipped
 from saferl.envs.transforms import SafetyProjector
 from saferl.training.progress import Budget
 
@@ -90,7 +90,7 @@ def load_policy(source: str | Path, device: str = "cpu", project: bool = True) -
     """A policy that ships with saferl, or one of your own, ready to drive.
 
     Args:
-        source: the name of a policy that ships with saferl (``arsac``), or the path of a run, a checkpoint, or an exported
+        source: the name of a policy that ships with saferl (``arsac``; ``./arsac`` is a path), or the path of a run, a checkpoint, or an exported
             ``policy.safetensors``.
         device: of the networks.
         project: whether the projector corrects its actions, if it was trained with one.
@@ -100,7 +100,11 @@ def load_policy(source: str | Path, device: str = "cpu", project: bool = True) -
         FileNotFoundError: the run has no checkpoint.
     """
     path = Path(source)
-    path = path if path.exists() else pretrained_run(str(source))
+    if str(source) in shipped():
+        path = pretrained_run(str(source))
+    elif not path.exists():
+        names = ", ".join(shipped())
+        raise ValueError(f"load_policy takes a path, or one of {names}, got {str(source)!r}.")
     cfg = run_config(path)
     cfg.device = device
     if "compile" in cfg.projector:

@@ -19,13 +19,18 @@ def config_dir() -> str:
     raise FileNotFoundError(f"saferl's conf folder is neither in {PACKAGE} nor in its parent.")
 
 
+def shipped(root: Path = PACKAGE / "pretrained") -> list[str]:
+    """Names of the policies that ship with saferl."""
+    return sorted(path.name for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
+
+
 def pretrained_run(name: str, root: Path = PACKAGE / "pretrained") -> Path:
     """Folder of a policy that ships with saferl, as :func:`saferl.checkpoint.run.export` wrote it.
 
     Raises:
         ValueError: no policy has this name; lists those that there are.
     """
-    names = sorted(path.name for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
+    names = shipped(root)
     if name not in names:
         raise ValueError(
             f"pretrained must be one of {', '.join(names)}, got {name!r}."

@@ -1,0 +1,93 @@
+"""Policies that ship, and any policy as one module."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torchrl.envs import TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+import saferl
+from saferl.algorithms.policy import SafePolicy, trained_agent
+from saferl.checkpoint.policy import EXPORTED
+from saferl.checkpoint.run import run_config
+from saferl.config.locate import pretrained_run, shipped
+from saferl.envs.intersection import BatchedIntersection, Scenario
+
+SHIPPED = ("arsac", "asac", "sac_lag")
+SCENARIO = Scenario(task="mixed").as_test()
+
+
+def test_what_ships_is_small_and_has_a_card():
+    assert set(SHIPPED) <= set(shipped())
+    for name in shipped():
+        folder = pretrained_run(name)
+        assert (folder / EXPORTED).stat().st_size <= 2e6
+        card = (folder / "README.md").read_text(encoding="utf-8")
+        for words in (
+            f"# {name}",
+            "## Trained",
+            "## Tested",
+            "python -m saferl ",
+            "seed",
+            "Not for",
+        ):
+            assert words in card, f"{name}: {words}"
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_shipped_policy_drives(name: str):
+    """Eight episodes, the same actions as with the projector as a transform of the environment."""
+    policy = saferl.load_policy(name)
+    cfg = run_config(pretrained_run(name))
+    assert cfg.algo_name == name and (policy.projector is not None) == (name == "arsac")
+    seeds = SCENARIO.episodes(11, 8)
+    state = BatchedIntersection(SCENARIO, 8).reset(seeds=seeds)
+    agent = trained_agent(cfg, pretrained_run(name))
+    env = TransformedEnv(BatchedIntersection(SCENARIO, 8), *agent.transforms)
+    theirs = env.reset(seeds=seeds)
+    alone = BatchedIntersection(SCENARIO, 8)
+    alone.reset(seeds=seeds)
+    for _ in range(40):
+        mine = policy(state)
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            theirs = env.step(agent.actor(theirs))
+        executed = theirs["next"].get("action_executed", theirs["action"])
+        torch.testing.assert_close(mine["action"], executed)
+        if policy.projector is not None:
+            for key in ("risk_before", "risk_after", "intervened", "feasible"):
+                torch.testing.assert_close(mine[key], theirs["next", key])
+        state = alone.step_mdp(alone.step(mine.clone()))
+        theirs = env.step_mdp(theirs)
+    speed = torch.hypot(state["ego"][:, 0], state["ego"][:, 1])
+    assert speed.max() > 3.0  # it drives
+
+
+def test_without_its_projector_the_mean_action_is_executed():
+    seen = BatchedIntersection(SCENARIO, 8).reset(seeds=SCENARIO.episodes(11, 8))
+    whole, bare = saferl.load_policy("arsac"), saferl.load_policy("arsac", project=False)
+    assert bare.projector is None
+    torch.testing.assert_close(whole(seen.clone())["action_proposed"], bare(seen.clone())["action"])
+
+
+def test_a_policy_that_is_not_there_is_named(tmp_path: Path):
+    with pytest.raises(
+        ValueError, match=r"load_policy takes a path, or one of arsac, .*, got 'nothing'"
+    ):
+        saferl.load_policy("nothing")
+    (tmp_path / EXPORTED).write_bytes(b"damaged")
+    with pytest.raises(ValueError, match="damaged"):
+        saferl.load_policy(tmp_path)
+    with pytest.raises(AttributeError, match="no attribute 'load_polcy'"):
+        saferl.load_polcy  # noqa: B018
+
+
+def test_a_policy_is_a_module():
+    policy = saferl.load_policy("arsac")
+    assert isinstance(policy, SafePolicy) and sum(p.numel() for p in policy.parameters()) > 1000
+    seen = BatchedIntersection(SCENARIO, 2).reset(seeds=SCENARIO.episodes(0, 2))
+    first = policy(seen.clone())["action"]
+    policy.load_state_dict(policy.state_dict())
+    torch.testing.assert_close(policy(seen.clone())["action"], first)
