@@ -95,7 +95,7 @@ def check_risk(risk: Any) -> Callable[[Tensor], Tensor]:
         shape = tuple(risk(torch.zeros(2, 3, 1)).shape)
     except Exception as error:
         raise ValueError(
-            f"risk must be a function of values [n, *B, K], such as saferl.modules.Largest(), got {risk!r}."
+            f"risk must be a function, such as saferl.modules.Largest(), of values [n, *B, K], got {risk!r}."
         ) from error
     if shape != (3, 1):
         raise ValueError(
