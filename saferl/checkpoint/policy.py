@@ -14,7 +14,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 #: The name of the file in its folder.
@@ -60,7 +60,7 @@ def write_policy(
     about[_CHECKSUM] = _checksum(tensors, config, numbers)
     folder.mkdir(parents=True, exist_ok=True)
     part, file = folder / f".{EXPORTED}.part", folder / EXPORTED
-    save_file(tensors, part, metadata=about)
+    part.write_bytes(save(tensors, metadata=about))  # which everybody may read who may read the folder
     os.replace(part, file)
     return file
 

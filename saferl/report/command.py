@@ -27,12 +27,15 @@ def main(arguments: list[str] | None = None) -> None:
     if given.play < 0:
         raise SystemExit(f"error: --play must be >= 0, got {given.play}.")
     logging.basicConfig(level=logging.INFO, format="%(message)s")  # says when a driver plays
-    from saferl.report.build import build  # late: help needs no torch
+    import torch  # late: help needs none of these
+
+    from saferl.report.build import build
     from saferl.report.files import write
     from saferl.report.html import write_page
     from saferl.report.replays import lying, made
     from saferl.report.text import states, verdicts
 
+    torch.set_num_threads(1)  # of a few episodes at once; more threads wait for each other
     try:
         report, traces = build(given.folders, given.out, given.against), lying(given.folders)
         if not report.runs and not traces:
