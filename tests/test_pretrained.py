@@ -91,3 +91,12 @@ def test_a_policy_is_a_module():
     first = policy(seen.clone())["action"]
     policy.load_state_dict(policy.state_dict())
     torch.testing.assert_close(policy(seen.clone())["action"], first)
+
+
+def test_what_is_not_finite_is_refused_and_a_device_is_named():
+    seen = BatchedIntersection(SCENARIO, 2).reset(seeds=SCENARIO.episodes(0, 2))
+    policy = saferl.load_policy("arsac", device=torch.device("cpu"))
+    assert not policy.training and set(policy.out_keys) <= set(policy(seen.clone()).keys())
+    seen["ego"][0, 0] = torch.nan
+    with pytest.raises(ValueError, match="an action that is not finite"):
+        policy(seen)

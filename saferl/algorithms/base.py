@@ -56,6 +56,13 @@ class Agent:
         return getattr(self.loss, "cost_value", None)
 
     @property
+    def limit(self) -> float | None:
+        """What the risk is to stay below in each state: the projector's, else the loss's; None where nothing limits it there."""
+        if self.projector is not None:
+            return self.projector.limit
+        return float(getattr(self.loss, "risk_limit", 0.0)) or None
+
+    @property
     def stored(self) -> tuple[Any, ...]:
         """Keys of a transition that are kept: what the networks read of a state and of the next, and :data:`STORED`."""
         return (*self.observed, *(("next", key) for key in self.observed), *STORED)

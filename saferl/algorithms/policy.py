@@ -17,6 +17,11 @@ from saferl.config.locate import pretrained_run, shipped
 from saferl.envs.transforms import SafetyProjector
 from saferl.training.progress import Budget
 
+#: What a policy with a projector writes besides the action.
+REPORTED = (
+    "action_proposed", "risk_before", "risk_after", "projection_steps", "intervened", "feasible",
+)  # fmt: skip
+
 
 class SafePolicy(TensorDictModuleBase):
     """The mean action of a policy, corrected wherever its risk exceeds a limit: what ships.
@@ -41,6 +46,8 @@ class SafePolicy(TensorDictModuleBase):
     >>> out = policy(TensorDict({"x": torch.tensor([[0.2], [0.9]])}, [2]))
     >>> bool((out["action"] <= 0.5).all()), out["intervened"].flatten().tolist()
     (True, [False, True])
+    Raises:
+        ValueError: in a step, an action is not finite.
     """
 
     def __init__(
@@ -52,7 +59,7 @@ class SafePolicy(TensorDictModuleBase):
     ):
         super().__init__()
         self.in_keys: list = list(actor.in_keys)
-        self.out_keys: list = ["action"]
+        self.out_keys: list = ["action", *(REPORTED if projector is not None else ())]
         self.actor, self.projector, self.box = actor, projector, {"low": low, "high": high}
 
     @torch.no_grad()
@@ -60,6 +67,10 @@ class SafePolicy(TensorDictModuleBase):
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             seen = self.actor(tensordict.select(*self.in_keys))
         action = seen["action"]
+        if not action.isfinite().all():
+            raise ValueError(
+                "the policy gave an action that is not finite; look at what it observes."
+            )
         if self.projector is None:
             return tensordict.set("action", action)
         report = self.projector.correct(seen, **self.box)
@@ -86,7 +97,9 @@ def trained_agent(cfg: DictConfig, path: Path) -> Agent:
     return agent
 
 
-def load_policy(source: str | Path, device: str = "cpu", project: bool = True) -> SafePolicy:
+def load_policy(
+    source: str | Path, device: str | torch.device = "cpu", project: bool = True
+) -> SafePolicy:
     """A policy that ships with saferl, or one of your own, ready to drive.
 
     Args:
@@ -106,10 +119,10 @@ def load_policy(source: str | Path, device: str = "cpu", project: bool = True) -
         names = ", ".join(shipped())
         raise ValueError(f"load_policy takes a path, or one of {names}, got {str(source)!r}.")
     cfg = run_config(path)
-    cfg.device = device
+    cfg.device = str(torch.device(device))
     if "compile" in cfg.projector:
         cfg.projector.compile = (
             False  # which takes minutes and is worth it for millions of decisions
         )
     agent = trained_agent(cfg, path)
-    return SafePolicy(agent.actor, agent.projector if project else None)
+    return SafePolicy(agent.actor, agent.projector if project else None).eval()  # pyright: ignore

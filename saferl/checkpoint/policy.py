@@ -60,7 +60,9 @@ def write_policy(
     about[_CHECKSUM] = _checksum(tensors, config, numbers)
     folder.mkdir(parents=True, exist_ok=True)
     part, file = folder / f".{EXPORTED}.part", folder / EXPORTED
-    part.write_bytes(save(tensors, metadata=about))  # which everybody may read who may read the folder
+    part.write_bytes(
+        save(tensors, metadata=about)
+    )  # which everybody may read who may read the folder
     os.replace(part, file)
     return file
 

@@ -29,6 +29,7 @@ from saferl.config.locate import pretrained_run
 from saferl.envs.intersection import Scenario
 from saferl.envs.intersection.true_scene import TrueScene
 from saferl.envs.task import Task
+from saferl.evaluation.crashes import COLUMNS as CRASH
 from saferl.evaluation.crashes import explain
 from saferl.evaluation.crashes import table as crash_table
 from saferl.evaluation.play import envs_at_once
@@ -51,6 +52,7 @@ class Candidate:
         transforms: what it drives with.
         critics: Q_c(s, a) that it has learned, if it has, and their ``limit``.
         about: what else is known of its training.
+        origin: what a trace says of it.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Candidate:
     critics: TensorDictModuleBase | None = None
     limit: float | None = None
     about: Mapping[str, Any] = field(default_factory=dict)
+    origin: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def trained(cls, name: str, cfg: DictConfig, path: Path, project: bool = True) -> Candidate:
@@ -73,7 +76,10 @@ class Candidate:
         agent = trained_agent(cfg, path)
         transforms = agent.transforms if project else ()
         about = {"cost_limit": cfg.cost_limit}
-        return cls(name, agent.actor, transforms, agent.risk, cfg.risk_limit, about)
+        origin = {"algo": cfg.algo_name, "training_seed": cfg.seed}
+        if not project and agent.projector is not None:
+            origin["algo"] += " unprojected"
+        return cls(name, agent.actor, transforms, agent.risk, agent.limit, about, origin)
 
 
 def pictures(
@@ -105,14 +111,15 @@ def drawn(rows: list[dict], cfg: DictConfig) -> list[dict]:
     """Those of a test's episodes that ``draw`` and ``draw_most`` or ``episode`` ask for."""
     if (numbers := cfg.get("episode")) is not None:
         return [rows[number] for number in ([numbers] if isinstance(numbers, int) else numbers)]
-    if cfg.draw == "none":
+    draw, most = cfg.draw, cfg.draw_most
+    if draw == "none":
         return []
-    column = {"collisions": "collision"}.get(cfg.draw, cfg.draw)
+    column = {"collisions": "collision"}.get(draw, draw)
     found = [row for row in rows if column == "all" or row[column]]
-    if len(found) > cfg.draw_most or not found:
-        few = f"the first {cfg.draw_most} are drawn (draw_most)" if found else "none is drawn"
-        log.info("draw=%s: %d of %d episodes, %s.", cfg.draw, len(found), len(rows), few)
-    return found[: cfg.draw_most]
+    if len(found) > most or not found:
+        few = f"the first {most} are drawn (draw_most)" if found else "none is drawn"
+        log.info("draw=%s: %d of %d episodes, %s.", draw, len(found), len(rows), few)
+    return found[:most]
 
 
 def evaluate(cfg: DictConfig) -> None:
@@ -155,22 +162,20 @@ def look_into(cfg: DictConfig, task: Scenario, who: Candidate, rows: list[dict],
     if chosen and (cfg.trace != "none" or cfg.why):
         transforms = [TrueScene(), *who.transforms]
         at_once = envs_at_once(len(chosen), cfg.env.num_envs)
+        about = {"policy": who.name, "env": cfg.env._target_.rpartition(".")[2], **who.origin}
         device = device_of(cfg.device)
         with closing(build_env(cfg.env, task, at_once, 0, device, transforms)) as several:
-            traced = record(
-                who.policy, several, chosen, who.critics, who.limit, policy=who.name, seed=cfg.seed
-            )
+            traced = record(who.policy, several, chosen, who.critics, who.limit, **about)
         for transform in who.transforms:
             transform.reset_parent()
-    if traced is not None and cfg.trace != "none":
-        log.info("Trace: %s", traced.save(out))
+    if cfg.trace != "none":
+        log.info("Trace: %s", traced.save(out) if traced else "none, as there was no crash")
     if cfg.why:
-        crashes = explain(traced, task) if traced is not None else []
-        if crashes:
-            with (out / "crashes.csv").open("w", newline="") as file:
-                writer = csv.DictWriter(file, list(crashes[0]), lineterminator="\n")
-                writer.writeheader()
-                writer.writerows(crashes)
+        crashes = explain(traced, task) if traced else []
+        with (out / "crashes.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, CRASH, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(crashes)
         log.info("\n%s", crash_table(crashes, len(rows)))
 
 
@@ -254,7 +259,8 @@ def choose_policy(
     if source == "policy":
         cfg = on_its_own_task(cfg, cfg, overrides)
         task = make(cfg.task)
-        return cfg, task, Candidate(name, task.driver(name, cfg.seed))
+        driver = task.driver(name, cfg.seed)
+        return cfg, task, Candidate(name, driver, origin={"algo": name})
     path = pretrained_run(name) if source == "pretrained" else Path(name)
     trained = run_config(path, source)
     check_targets(trained)

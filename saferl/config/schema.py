@@ -292,7 +292,10 @@ class Test:
             return
         if self.draw != "none":
             raise ValueError(f"Give one of draw and episode, got {self.draw} and {self.episode}.")
-        for number in self.episode if isinstance(self.episode, list) else [self.episode]:
+        numbers = self.episode if isinstance(self.episode, list) else [self.episode]
+        if len(set(map(str, numbers))) < max(len(numbers), 1):
+            raise ValueError(f"episode must be different numbers, got {self.episode}.")
+        for number in numbers:
             if type(number) is not int or not 0 <= number < self.episodes:
                 raise ValueError(
                     "episode must be a number or a list of numbers, each >= 0 and < "

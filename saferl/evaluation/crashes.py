@@ -24,6 +24,11 @@ MOMENTS = tuple(0.5 * k for k in range(1, 11))
 #: How long before a crash a warning is looked for, and how long after it nobody may have crashed, s.
 BEFORE, AFTER = 5.0, 5.0
 _AT_ONCE = 630  # episodes
+#: Of :func:`explain`.
+COLUMNS: tuple[str, ...] = (
+    "episode", "seed", "task", "what", "car", "time", "speed", "car_speed", "priority", "warning", "corrected", "braking",
+    "cautious",
+)  # fmt: skip
 _FROM = ("from behind", "from the left", "oncoming", "from the right")
 _WAY = ("turning left", "straight on", "straight on", "turning right")
 
@@ -92,7 +97,7 @@ def explain(trace: Trace, scenario: Scenario) -> list[dict[str, Any]]:
         ``warning``: how many seconds before the crash, at most 5, the risk of what the policy proposed was first above
         the limit; ``corrected``: the share of the decisions from then on that the projector changed; ``braking`` and
         ``cautious``: how many seconds before the crash, at most 5, the last moment lay from which braking along the lane, or the
-        cautious driver, would have come without a crash to 5 s after it, in the batched simulator. None where there is none. A replay that does not end
+        cautious driver, would have come without a crash to 5 s after the last of these crashes, in the batched simulator. None where there is none. A replay that does not end
         in a crash by itself, as it may for an episode of highway-env, has neither.
     """
     dt, limit = trace.about["dt"], trace.about.get("risk_limit")

@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 
 from saferl.envs.intersection import Scenario
 from saferl.envs.intersection.dynamics import to_physical
-from saferl.envs.intersection.geometry import frame, separation
+from saferl.envs.intersection.geometry import rectangle_distance
 from saferl.envs.intersection.observation import as_world
 from saferl.evaluation.play import play
 from saferl.modules import BoundCritics, MMAMPolicyEncoder
@@ -26,6 +26,11 @@ from saferl.modules import BoundCritics, MMAMPolicyEncoder
 TRACE = "trace.npz"
 #: Rows that networks are asked about at once.
 _AT_ONCE = 8192
+#: Of the rows.
+COLUMNS = (
+    "ego", "vehicles", "vehicle_route", "observed", "priority", "attention", "nearest", "gap", "proposed", "executed",
+    "intervened", "members", "members_executed", "risk", "risk_executed", "cost_share", "reward", "cost",
+)  # fmt: skip
 _READ = ("ego", "vehicles", "action", "scene")
 _TOLD = ("scene", "reward", "cost", "action_executed", "intervened")
 
@@ -42,11 +47,12 @@ class Trace:
             episode i, one for each decision and one for where it ended, in which what belongs to a decision is NaN or False.
         rows: arrays [R, ...] by name:
 
-            - ``ego`` [6]: x, y (m), v_x, v_y (m/s), phi (rad), omega (rad/s); x points east, y south.
+            - ``ego`` [6]: x, y (m; east and south of the middle of the junction), v_x, v_y (m/s; ahead and to the right of the
+              body), phi (rad, clockwise from the east), omega (rad/s).
             - ``vehicles`` [N, 6]: the same of each other car, NaN while it is not on the road; ``vehicle_route`` [N] int8,
               ``4 * arm + k`` (:mod:`saferl.envs.intersection.roads`).
             - ``observed`` [N] bool: in the observation. ``priority`` [N] bool: goes before the ego by the rules of the road.
-            - ``attention`` [N]: of the policy's ego-attention, mean of its heads; all NaN where the policy has none.
+            - ``attention`` [N]: of the policy's ego-attention, mean of its heads; the rest to 1 is on the ego itself; all NaN where the policy has none.
             - ``nearest`` int16 and ``gap`` (m): the car whose body is nearest, and how far; -1 and NaN where there is none.
             - ``proposed`` and ``executed`` [2]: acceleration (m/s^2) and steering angle (rad) before and after the projector;
               ``intervened`` bool.
@@ -95,6 +101,8 @@ class Trace:
             episodes = {name.removeprefix("episode_"): arrays.pop(name) for name in names}
             if len(episodes["first"]) != len(episodes["episode"]) + 1:
                 raise ValueError("its episodes are not whole")
+            if missing := [name for name in COLUMNS if name not in arrays]:
+                raise ValueError(f"it has no {missing[0]}")
             if any(len(array) != episodes["first"][-1] for array in arrays.values()):
                 raise ValueError("its rows are not whole")
         except FileNotFoundError:
@@ -183,16 +191,14 @@ def _kept(step: TensorDictBase) -> TensorDictBase:
 
 
 def _nearest(scene: TensorDictBase) -> dict[str, Tensor]:
-    ego, others = scene["ego"], scene["vehicles"].movedim(-2, 0)
-    body, bodies = (frame(s[..., 0], s[..., 1], s[..., 4]) for s in (ego, others))
-    if not len(others):
-        gap = torch.full((len(ego),), torch.nan)
-        return {"gap": gap, "nearest": torch.full_like(gap, -1, dtype=torch.int16)}
-    gaps = separation(body, bodies).nan_to_num(torch.inf)
-    gap, nearest = gaps.min(0)
+    poses = [scene[key][..., [0, 1, 4]] for key in ("ego", "vehicles")]
+    gaps = rectangle_distance(poses[0][:, None], poses[1]).nan_to_num(torch.inf)
+    if not gaps.shape[1]:
+        gaps = torch.full((len(gaps), 1), torch.inf)
+    gap, nearest = gaps.min(1)
     there = gap.isfinite()
     return {
-        "gap": torch.where(there, gap.clamp_min(0.0), torch.nan),
+        "gap": torch.where(there, gap, torch.nan),
         "nearest": torch.where(there, nearest, -1).to(torch.int16),
     }
 

@@ -37,7 +37,8 @@ def main(arguments: list[str] | None = None) -> None:
 
     torch.set_num_threads(1)  # of a few episodes at once; more threads wait for each other
     try:
-        report, traces = build(given.folders, given.out, given.against), lying(given.folders)
+        report = build(given.folders, given.out, given.against)
+        traces = lying(given.folders, given.out / "traces")
         if not report.runs and not traces:
             names = ", ".join(map(str, given.folders))
             raise ValueError(f"no run and no trace below {names}: give folders of runs or tests.")

@@ -26,6 +26,7 @@ from saferl.envs.intersection.geometry import (
 )
 from saferl.evaluation.crashes import way
 from saferl.evaluation.trace import Trace
+from saferl.report.systems import LABELS
 
 #: Columns of the rows of a trace, and how many of them make a unit: they are stored as 16-bit integers.
 SCALES = {
@@ -33,10 +34,10 @@ SCALES = {
     "vehicles": (100, 100, 100, 100, 10_000, 1000),
     "proposed": (1000, 10_000),
     "executed": (1000, 10_000),
-    "members": 10_000,
-    "members_executed": 10_000,
-    "risk": 10_000,
-    "risk_executed": 10_000,
+    "members": 2000,
+    "members_executed": 2000,
+    "risk": 2000,
+    "risk_executed": 2000,
     "attention": 10_000,
     "cost_share": 10_000,
     "cost": 10_000,
@@ -70,7 +71,7 @@ def packed(trace: Trace) -> dict[str, Any]:
     steps = np.diff(table, axis=1, prepend=np.int16(0))  # wraps, and so does their sum
     data = gzip.compress(steps.astype("<i2").tobytes(), 9, mtime=0)
     return {
-        "about": dict(trace.about),
+        "about": {**trace.about, "label": _label(trace.about)},
         "episodes": {key: value.tolist() for key, value in trace.episodes.items()},
         "ways": [
             [way(int(route)) for route in trace.rows["vehicle_route"][first]]
@@ -80,6 +81,12 @@ def packed(trace: Trace) -> dict[str, Any]:
         "rows": len(table[0]),
         "data": base64.b64encode(data).decode(),
     }
+
+
+def _label(about: Mapping[str, Any]) -> str:
+    """What to call whoever drives."""
+    name = str(about.get("algo", about.get("policy")))
+    return LABELS.get(name, name)
 
 
 def road() -> dict[str, Any]:

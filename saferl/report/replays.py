@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import hydra
 import numpy as np
 
 from saferl.algorithms.assemble import build_env
 from saferl.algorithms.policy import trained_agent
-from saferl.checkpoint.run import CONFIG, run_config
+from saferl.checkpoint.run import latest, run_config
 from saferl.envs.intersection import Scenario
 from saferl.envs.intersection.true_scene import TrueScene
 from saferl.evaluation.play import envs_at_once
@@ -28,27 +28,18 @@ log = logging.getLogger(__name__)
 _AT_ONCE = 250
 
 
-def lying(folders: Sequence[Path]) -> list[Trace]:
-    """All traces below these folders, each named by the run that it is of, if it is of one; of a damaged one a line is said."""
+def lying(folders: Sequence[Path], but: Path) -> list[Trace]:
+    """All traces below these folders, ``but`` for those below another; of a damaged one a line is said."""
     paths = {path.resolve(): path for each in folders for path in sorted(each.glob(f"**/{TRACE}"))}
     traces = []
-    for path in paths.values():
+    for real, path in paths.items():
+        if real.is_relative_to(but.resolve()):
+            continue
         try:
-            traces.append(_named(Trace.load(path), path))
+            traces.append(Trace.load(path))
         except (ValueError, OSError) as error:
             log.warning("Left out: %s", error)
     return traces
-
-
-def _named(trace: Trace, path: Path) -> Trace:
-    run = next((each for each in path.parents if (each / CONFIG).is_file()), None)
-    if run is None:
-        return trace
-    cfg = run_config(run)
-    label = LABELS.get(cfg.algo_name, cfg.algo_name)
-    return dataclasses.replace(
-        trace, about={**trace.about, "label": label, "training_seed": cfg.seed}
-    )
 
 
 def made(runs: Sequence[Run], count: int, out: Path, drivers: Path) -> list[Trace]:
@@ -84,14 +75,17 @@ def _trace(
     name: str, run: Run | None, first: Run, rows: list[dict], folder: Path, seed: int
 ) -> Trace:
     """One system's trace of these episodes; of a scripted driver where there is no run."""
-    about = {"label": LABELS.get(name, name)} | ({} if run is None else {"training_seed": seed})
+    about: dict[str, Any] = {"algo": name}
+    if run is not None:  # a run that goes on is another policy
+        about |= {"training_seed": seed, "checkpoint": latest(run.folder).name}
     try:
         trace = Trace.load(folder)
-        if trace.episodes["seed"].tolist() == [row["seed"] for row in rows]:
+        same = all(trace.about.get(key) == value for key, value in about.items())
+        if same and trace.episodes["seed"].tolist() == [row["seed"] for row in rows]:
             return trace
     except (OSError, ValueError):  # not there, or cut off
         pass
-    log.info("%s plays %d episodes again.", about["label"], len(rows))
+    log.info("%s plays %d episodes again.", LABELS.get(name, name), len(rows))
     cfg = run_config((run or first).folder)
     cfg.device = "cpu"
     cfg.env.compile_physics = False
@@ -100,11 +94,11 @@ def _trace(
     scenario: Scenario = hydra.utils.instantiate(cfg.task).as_test()
     width = envs_at_once(len(rows), _AT_ONCE)
     if run is None:
-        policy, transforms, critics = scenario.driver(name, seed), [], None
+        policy, transforms, critics, limit = scenario.driver(name, seed), [], None, None
     else:
         agent = trained_agent(cfg, run.folder)
-        policy, transforms, critics = agent.actor, agent.transforms, agent.risk
+        policy, transforms, critics, limit = agent.actor, agent.transforms, agent.risk, agent.limit
     with closing(build_env(cfg.env, scenario, width, 0, "cpu", [TrueScene(), *transforms])) as env:
-        trace = record(policy, env, rows, critics, cfg.risk_limit, policy=name, **about)
+        trace = record(policy, env, rows, critics, limit, policy=name, **about)
     trace.save(folder)
     return trace

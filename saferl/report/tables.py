@@ -97,7 +97,7 @@ def _table(table: str, title: str, systems: Sequence[System]) -> Table:
         best = {
             figure: better(means)
             for figure, better in BETTER.items()
-            if (means := [cell.mean for own in trained if (cell := own[figure])])
+            if len(means := [cell.mean for own in trained if (cell := own[figure])]) > 1
         }
         rows += [
             Row(

@@ -19,6 +19,7 @@ from saferl.envs.intersection.geometry import (
     offroad,
     on_pavement,
     overlap,
+    rectangle_distance,
     wrap,
 )
 
@@ -274,3 +275,15 @@ def test_wrap_folds_into_half_open_turn():
     table = torch.tensor([0.0, math.pi, -math.pi, 1.5 * math.pi], dtype=torch.float64)
     expected = torch.tensor([0.0, -math.pi, -math.pi, -0.5 * math.pi], dtype=torch.float64)
     assert torch.allclose(wrap(table), expected)
+
+
+def test_the_distance_of_two_bodies_is_shapelys():
+    generator = torch.Generator().manual_seed(3)
+    poses = torch.rand(2, 400, 3, generator=generator, dtype=torch.float64) * torch.tensor(
+        [14.0, 14.0, 7.0]
+    )
+    ours = rectangle_distance(*poses)
+    outlines = [[shapely.Polygon(corners(pose).numpy()) for pose in side] for side in poses]
+    theirs = [a.distance(b) for a, b in zip(*outlines, strict=True)]
+    torch.testing.assert_close(ours, torch.tensor(theirs, dtype=torch.float64), atol=1e-9, rtol=0)
+    assert 50 < (ours == 0).sum() < 350

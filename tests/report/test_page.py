@@ -155,18 +155,42 @@ def test_a_visitor_plays_filters_and_jumps(traces, tmp_path: Path, size: str):
     seed = int(trace.episodes["seed"][number])
     seen = visit(path, f"#replay?run=0&seed={seed}&t=1.5", size)
     assert seen["wrong"] == []
-    assert seen["runs"] == ["blind", "<b>cautious</b>"] and seen["hidden"] == [True, False]
+    assert seen["runs"] == ["blind driver", "<b>cautious</b>"] and seen["hidden"] == [True, False]
     assert seen["row"] == 15 and seen["all"] == 12 and seen["stepped"] == 11 and seen["moved"]
     crash = np.isin(trace.episodes["outcome"], ("hit_vehicle", "left_road"))
     assert len(seen["crashes"]) == crash.sum() > 0
     assert seen["left"] == (crash & (trace.episodes["route"] == "lt")).sum()
     assert seen["beforeTheEnd"] == 20 and seen["scenes"] == 2
-    assert seen["captions"][0].startswith("blind: episode") and "hits a car" in seen["captions"][0]
+    assert (
+        seen["captions"][0].startswith("blind driver: episode")
+        and "hits a car" in seen["captions"][0]
+    )
     assert seen["captions"][1].startswith("<b>cautious</b>: episode")  # a name, no markup
     assert re.fullmatch(r"#replay\?run=0&seed=\d+&t=[\d.]+&beside=1", seen["address"])
     assert seen["other"] and seen["again"] and seen["played"] > 5 and seen["playing"]
     assert "nearest: car" in seen["words"] and seen["middle"]
     assert seen["theme"] in ("light", "dark") and seen["wide"] <= 0
+
+
+@needs_browser
+def test_other_traffic_is_not_shown_beside(traces, tmp_path: Path):
+    """The same seed with more cars on the road, or on another route, is another episode."""
+    scenario = Scenario(task="mixed", scenario="dense").as_test()
+    rows = evaluate(Driver(), BatchedIntersection(scenario, 3), 3, 5, False)
+    env = TransformedEnv(BatchedIntersection(scenario, 3), TrueScene())
+    dense = record(Driver(), env, rows, policy="blind")
+    assert dense.episodes["seed"][0] == traces[0].episodes["seed"][0]
+    path = tmp_path / "page.html"
+    script = """window.addEventListener("load", () => setTimeout(() => { const out = document.createElement("pre"); out.id = "seen";
+      out.textContent = JSON.stringify([...document.querySelectorAll("#scenes figcaption")].map((f) => f.textContent)); document.body.append(out); }, 500));"""
+    path.write_text(page("", "", [traces[0], traces[1], dense], scripts=[script]), encoding="utf-8")
+    where = f"#replay?run=0&seed={dense.episodes['seed'][0]}&beside="
+    mine, same = visit(path, f"{where}1")
+    assert mine.startswith("blind driver, nominal: episode 0") and "episode 0" in same
+    assert (
+        visit(path, f"{where}2")[1]
+        == "blind driver, dense: it has not played this episode in this traffic"
+    )
 
 
 @needs_browser

@@ -162,7 +162,7 @@ def _save_mp4(episode: Episode, path: Path) -> None:
     from imageio_ffmpeg import write_frames  # pyright: ignore  (an extra)
 
     indices = shown(episode)
-    fps = 1 / (episode.dt * (indices[1] - indices[0]))
+    fps: Any = 1 / (episode.dt * (indices[1] - indices[0]))
     writer = write_frames(str(path), (SIZE, SIZE + STRIP), fps=fps, quality=7, macro_block_size=2)
     writer.send(None)
     for picture in pictures(episode):

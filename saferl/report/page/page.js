@@ -36,7 +36,9 @@ const width = (run, name) => run.columns[name].width;
 const cars = (run) => width(run, "gap") && run.columns.attention.width;
 const firstRow = (run, episode) => run.episodes.first[episode];
 const count = (run, episode) => run.episodes.first[episode + 1] - run.episodes.first[episode];
-const runName = (run) => run.about.label || run.about.policy;
+/** What tells tests apart, where they differ in it. */
+const differs = (key) => new Set(DATA.runs.map((r) => r.about[key])).size > 1;
+const runName = (run) => [run.about.label, ...["task", "scenario", "env"].filter(differs).map((key) => run.about[key])].join(", ");
 const seedOf = (run) => run.about.training_seed ?? "-";
 const called = (run) => runName(run) + (run.about.training_seed === undefined ? "" : `, seed ${run.about.training_seed}`);
 
@@ -72,6 +74,7 @@ function showEpisodes() {
     state.episode);
   $("count").textContent = `${found.length} of ${run.episodes.episode.length} episodes`;
   $("episode").disabled = !found.length;
+  $("stage").hidden = $("charts").hidden = !found.length;
 }
 
 /** Who is shown: [run, episode] of the chosen one, and of the other on the same traffic. */
@@ -80,9 +83,18 @@ function shown() {
   if (state.other >= 0) {
     const other = DATA.runs[state.other];
     const episode = other.episodes.seed.indexOf(mine.episodes.seed[state.episode]);
-    list.push([other, episode]);
+    list.push([other, episode >= 0 && alike(mine, state.episode, other, episode) ? episode : -1]);
   }
   return list;
+}
+/** Whether two episodes begin with the same cars in the same places. */
+function alike(mine, a, other, b) {
+  if (mine.episodes.route[a] !== other.episodes.route[b] || cars(mine) !== cars(other)) return false;
+  for (let k = 0; k < 6 * cars(mine); k++) {
+    const [x, y] = [at(mine, "vehicles", firstRow(mine, a), k), at(other, "vehicles", firstRow(other, b), k)];
+    if (Number.isNaN(x) !== Number.isNaN(y) || Math.abs(x - y) > 0.03) return false;
+  }
+  return true;
 }
 const longest = () => Math.max(...shown().map(([run, e]) => (e < 0 ? 1 : count(run, e))));
 const dt = () => DATA.runs[state.run].about.dt;
@@ -158,7 +170,7 @@ function build() {
   scenes = who.map(([run, episode]) => {
     const caption = document.createElement("b");
     caption.textContent = called(run);
-    const words = episode < 0 ? ": this episode is not in its trace"
+    const words = episode < 0 ? ": it has not played this episode in this traffic"
       : `: episode ${run.episodes.episode[episode]}, ${TASKS[run.episodes.route[episode]]}, ${ENDS[run.episodes.outcome[episode]]} at ${((count(run, episode) - 1) * run.about.dt).toFixed(1)} s`;
     const element = canvas($("scenes"), [caption, words]);
     element.parentElement.classList.toggle("alone", who.length === 1);
@@ -247,8 +259,9 @@ function drawScene({ run, episode, element }) {
   if (episode < 0) return;
   const base = firstRow(run, episode), last = count(run, episode) - 1, row = base + Math.min(state.row, last);
   const x = at(run, "ego", row, 0), y = at(run, "ego", row, 1);
-  const view = 30, scale = Math.min(w, h) / (2 * view);
-  const cx = Math.max(-16, Math.min(16, x)), cy = Math.max(-16, Math.min(28, y));
+  // The middle of the junction and the ego are both in sight.
+  const view = 40, scale = Math.min(w, h) / (2 * view);
+  const cx = Math.max(-24, Math.min(24, 0.45 * x)), cy = Math.max(-24, Math.min(24, 0.45 * y));
   c.translate(w / 2, h / 2);
   c.scale(scale, scale);
   c.translate(-cx, -cy);
@@ -358,7 +371,7 @@ function words() {
     parts.push(`looks most at car ${most} (${(100 * share).toFixed(0)}% of the attention)`);
   }
   const risk = at(run, "risk", row);
-  if (!Number.isNaN(risk)) parts.push(`risk ${risk.toFixed(3)} of ${run.about.risk_limit}`);
+  if (!Number.isNaN(risk)) parts.push(`risk ${risk.toFixed(3)}` + (run.about.risk_limit === null ? "" : ` of ${run.about.risk_limit}`));
   if (at(run, "intervened", row) > 0) parts.push(`corrected to ${at(run, "risk_executed", row).toFixed(3)}`);
   $("now").textContent = parts.join(" · ");
 }
@@ -471,6 +484,7 @@ async function start() {
   options($("task"), [["", "all"], ...[...new Set(Object.values(TASK_OF))].map((t) => [t, t])], "");
   options($("outcome"), [["", "all"], ["crash", "a crash"], ...Object.entries(ENDS)], "");
   $("show-replay").hidden = !DATA.runs.length;
+  $("show-report").hidden = !$("report").textContent.trim();
   $("show-report").addEventListener("click", () => { play(false); history.replaceState(null, "", "#report"); show("report"); });
   $("show-replay").addEventListener("click", () => { history.replaceState(null, "", "#replay"); show("replay"); });
   $("run").addEventListener("change", () => choose({ run: DATA.runs.findIndex((r) => runName(r) === $("run").value), other: -1, row: 0 }));
