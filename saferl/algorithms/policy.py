@@ -37,6 +37,9 @@ class SafePolicy(TensorDictModuleBase):
     also ``action_proposed`` [*B, A], ``risk_before``, ``risk_after`` [*B, 1], ``intervened`` [*B, 1] (bool) and what else
     :class:`~saferl.envs.transforms.SafetyProjector` tells.
 
+    Raises:
+        ValueError: in a step, an action is not finite.
+
     >>> import torch
     >>> from tensordict import TensorDict
     >>> from tensordict.nn import TensorDictModule
@@ -46,8 +49,6 @@ class SafePolicy(TensorDictModuleBase):
     >>> out = policy(TensorDict({"x": torch.tensor([[0.2], [0.9]])}, [2]))
     >>> bool((out["action"] <= 0.5).all()), out["intervened"].flatten().tolist()
     (True, [False, True])
-    Raises:
-        ValueError: in a step, an action is not finite.
     """
 
     def __init__(
@@ -58,7 +59,9 @@ class SafePolicy(TensorDictModuleBase):
         high: float = 1.0,
     ):
         super().__init__()
-        self.in_keys: list = list(actor.in_keys)
+        risk = () if projector is None else projector.risk.in_keys
+        keys = dict.fromkeys((*actor.in_keys, *risk))
+        self.in_keys: list = [key for key in keys if key != "action"]
         self.out_keys: list = ["action", *(REPORTED if projector is not None else ())]
         self.actor, self.projector, self.box = actor, projector, {"low": low, "high": high}
 

@@ -32,8 +32,8 @@ def main(arguments: list[str] | None = None) -> None:
     from saferl.report.build import build
     from saferl.report.files import write
     from saferl.report.html import write_page
-    from saferl.report.replays import lying, made
     from saferl.report.text import states, verdicts
+    from saferl.report.traces import lying, made
 
     torch.set_num_threads(1)  # of a few episodes at once; more threads wait for each other
     try:

@@ -13,7 +13,7 @@ from plotly.offline import get_plotlyjs
 from saferl.evaluation.trace import Trace
 from saferl.report.build import Report
 from saferl.report.files import CLAIMS, CURVES, EFFORT, READING
-from saferl.report.replay import page
+from saferl.report.player import page
 from saferl.report.systems import LABELS
 from saferl.report.text import (
     Grid,

@@ -20,7 +20,7 @@ from saferl.envs.intersection.drivers import CautiousDriver, Driver
 from saferl.envs.intersection.true_scene import TrueScene
 from saferl.evaluation.play import evaluate
 from saferl.evaluation.trace import Trace, record
-from saferl.report.replay import NOTHING, SCALES, packed, page
+from saferl.report.player import NOTHING, SCALES, packed, page
 
 BROWSER = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""

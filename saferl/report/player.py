@@ -1,4 +1,4 @@
-"""Traces as one HTML file that plays them: no server, no network."""
+"""The page that plays traces: one HTML file, no server, no network."""
 
 from __future__ import annotations
 

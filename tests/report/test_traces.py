@@ -51,7 +51,7 @@ def test_each_system_plays_the_same_episodes_again(command, tmp_path: Path, caps
     for words in ("Comparison on three driving tasks", "The paper's claims", "Learning curves"):
         assert words in html
     with monkeypatch.context() as patch:  # what was played is kept
-        patch.setattr("saferl.report.replays.record", None)
+        patch.setattr("saferl.report.traces.record", None)
         main(["paper", "--out", "report", "--play", "3"])
     command("train", "config", "resume=paper/sac/seed0", "frames=16")  # another policy
     capsys.readouterr()
