@@ -53,7 +53,8 @@ def build(folders: Sequence[Path], out: Path, against: str = "arsac") -> Report:
     if against not in known or against in DRIVERS:
         known = [name for name in known if name not in DRIVERS]
         raise ValueError(f"--against must be among {', '.join(known)}, got {against!r}.")
-    out.mkdir(parents=True, exist_ok=True)
+    if runs:
+        out.mkdir(parents=True, exist_ok=True)
     systems = [*drive(runs, out / "drivers"), *gather(runs)]
     return Report(
         runs,

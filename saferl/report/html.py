@@ -40,6 +40,7 @@ def write_page(report: Report, traces: Sequence[Trace], path: Path) -> Path:
     body = _body(report, bool(curves)) if report.runs else ""
     scripts = [get_plotlyjs()] if curves else []
     html = page("saferl report", body, traces, scripts=scripts, curves=curves)
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(html, encoding="utf-8")
     return path
 

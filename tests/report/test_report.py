@@ -213,8 +213,9 @@ def test_each_row_of_a_table_has_each_column(report):
     assert latex(grid, "A & B.", "t").count(r"\midrule") == 1 + 3
 
 
-def test_the_command(report, capsys, monkeypatch):
-    """The same report again, and mistakes in one line."""
+def test_the_command(report, capsys, monkeypatch, tmp_path: Path):
+    """The same report again, and mistakes in one line, which leave nothing behind."""
+    monkeypatch.chdir(tmp_path)
     out = report[1]
     folder = str(out.parent)
     monkeypatch.setattr(sys, "argv", ["report"])
@@ -231,6 +232,7 @@ def test_the_command(report, capsys, monkeypatch):
     ):
         with pytest.raises(SystemExit, match=f"^error: {line}"):
             main(arguments)
+    assert not [*tmp_path.iterdir()]
 
 
 def test_runs_that_have_only_begun_make_a_report_too(tmp_path: Path):
