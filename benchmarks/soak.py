@@ -28,7 +28,7 @@ from side_by_side import CLOCKS, write
 from simulation import resident
 
 from saferl.algorithms.assemble import build_trainer, complete
-from saferl.cli.evaluate import compiling
+from saferl.algorithms.policy import compiling
 from saferl.cli.train import claim, closing_test
 from saferl.config.locate import config_dir
 

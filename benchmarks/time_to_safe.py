@@ -42,7 +42,7 @@ from side_by_side import belongs, write
 
 from saferl.algorithms.assemble import build_env, build_trainer
 from saferl.algorithms.parts import make
-from saferl.cli.evaluate import compiling
+from saferl.algorithms.policy import compiling
 from saferl.cli.train import claim
 from saferl.config.locate import config_dir
 from saferl.envs.transforms import SafetyProjector

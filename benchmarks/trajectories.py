@@ -20,8 +20,9 @@ import torch
 from omegaconf import DictConfig
 
 from saferl.algorithms.assemble import build_env
+from saferl.algorithms.policy import compiling, trained_agent
 from saferl.checkpoint.run import run_config
-from saferl.cli.evaluate import compiling, on_its_own_task, trained_policy
+from saferl.cli.evaluate import on_its_own_task
 from saferl.config.locate import config_dir
 from saferl.envs.intersection.base import Scenario
 from saferl.envs.intersection.comparison import save_comparison
@@ -87,9 +88,11 @@ def test(
     trained.device = "cpu"
     own = on_its_own_task(cfg, trained, overrides)
     task: Scenario = hydra.utils.instantiate(own.task)
-    policy, transforms = (
-        (task.driver(run, seed), []) if run in DRIVERS else trained_policy(trained, Path(run))
-    )
+    if run in DRIVERS:
+        policy, transforms = task.driver(run, seed), []
+    else:
+        agent = trained_agent(trained, Path(run))
+        policy, transforms = agent.actor, agent.transforms
     seeds = task.episodes(seed, max(numbers) + 1)[numbers].tolist()
     with closing(build_env(own.env, task, len(seeds), seed, "cpu", transforms)) as env:
         episodes = record(policy, env, seeds)

@@ -167,3 +167,16 @@ def test_the_packages_names_are_there_and_no_others():
     assert set(package.__all__) <= set(dir(package))
     assert all(hasattr(package, name) for name in package.__all__)
     assert not hasattr(package, "Roundabout")
+
+
+SCRIPTS = sorted((PACKAGE.parent / "benchmarks").glob("*.py"))
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_what_a_script_takes_of_saferl_is_there(script: Path):
+    """Scripts run in the slow tests alone; what they import at their top can be looked up at once."""
+    for node in ast.parse(script.read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("saferl"):
+            module = importlib.import_module(node.module or "")
+            for alias in node.names:
+                assert hasattr(module, alias.name), f"{node.module} has no {alias.name}"

@@ -82,6 +82,15 @@ class SafePolicy(TensorDictModuleBase):
         return tensordict.set("action", report["action_executed"])
 
 
+def compiling(cfg: DictConfig, on: bool) -> DictConfig:
+    """A run's configuration with the physics and the projection compiled or not, as far as it has them."""
+    cfg = cfg.copy()
+    for part, key in (("env", "compile_physics"), ("projector", "compile")):
+        if key in cfg[part]:
+            cfg[part][key] = on
+    return cfg
+
+
 def trained_agent(cfg: DictConfig, path: Path) -> Agent:
     """The agent of a run or checkpoint, its projector as far as the training had come.
 
@@ -121,11 +130,8 @@ def load_policy(
     elif not path.exists():
         names = ", ".join(shipped())
         raise ValueError(f"load_policy takes a path, or one of {names}, got {str(source)!r}.")
-    cfg = run_config(path)
+    # Compiling takes minutes, and is worth it for millions of decisions.
+    cfg = compiling(run_config(path), False)
     cfg.device = str(torch.device(device))
-    if "compile" in cfg.projector:
-        cfg.projector.compile = (
-            False  # which takes minutes and is worth it for millions of decisions
-        )
     agent = trained_agent(cfg, path)
     return SafePolicy(agent.actor, agent.projector if project else None).eval()  # pyright: ignore

@@ -21,7 +21,7 @@ from torchrl.envs.transforms import Transform
 
 from saferl.algorithms.assemble import build_env
 from saferl.algorithms.parts import device_of, make, offered
-from saferl.algorithms.policy import trained_agent
+from saferl.algorithms.policy import compiling, trained_agent
 from saferl.checkpoint.run import run_config
 from saferl.cli.launch import job_folder
 from saferl.config.check import check_targets
@@ -188,15 +188,6 @@ def changed(overrides: Sequence[str]) -> dict[str, str]:
     told = dict(override.lstrip("+").split("=", 1) for override in overrides if "=" in override)
     told.pop("env.num_envs", None)  # no figure depends on it
     return {key: value for key, value in told.items() if key.startswith(("task.", "env."))}
-
-
-def compiling(cfg: DictConfig, on: bool) -> DictConfig:
-    """A run's configuration with the physics and the projection compiled or not, as far as it has them."""
-    cfg = cfg.copy()
-    for part, key in (("env", "compile_physics"), ("projector", "compile")):
-        if key in cfg[part]:
-            cfg[part][key] = on
-    return cfg
 
 
 def on_its_own_task(cfg: DictConfig, trained: DictConfig, overrides: Sequence[str]) -> DictConfig:

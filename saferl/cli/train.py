@@ -13,9 +13,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from saferl.algorithms.assemble import build_trainer, complete
 from saferl.algorithms.parts import make
+from saferl.algorithms.policy import compiling
 from saferl.checkpoint.lock import alone
 from saferl.checkpoint.run import CONFIG, begun, run_config, run_folder
-from saferl.cli.evaluate import Candidate, compiling, drawn, measure, pictures
+from saferl.cli.evaluate import Candidate, drawn, measure, pictures
 from saferl.cli.launch import job_folder
 from saferl.config.flat import MADE
 from saferl.config.limits import check_limits

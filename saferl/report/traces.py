@@ -12,7 +12,7 @@ import hydra
 import numpy as np
 
 from saferl.algorithms.assemble import build_env
-from saferl.algorithms.policy import trained_agent
+from saferl.algorithms.policy import compiling, trained_agent
 from saferl.checkpoint.run import latest, run_config
 from saferl.envs.intersection import Scenario
 from saferl.envs.intersection.true_scene import TrueScene
@@ -86,11 +86,8 @@ def _trace(
     except (OSError, ValueError):  # not there, or cut off
         pass
     log.info("%s plays %d episodes again.", LABELS.get(name, name), len(rows))
-    cfg = run_config((run or first).folder)
+    cfg = compiling(run_config((run or first).folder), False)
     cfg.device = "cpu"
-    cfg.env.compile_physics = False
-    if "compile" in cfg.projector:
-        cfg.projector.compile = False
     scenario: Scenario = hydra.utils.instantiate(cfg.task).as_test()
     width = envs_at_once(len(rows), _AT_ONCE)
     if run is None:
