@@ -18,6 +18,7 @@ PANELS = (
     "return",
     "cost_return",
     "lagrange_multiplier",
+    "intervention_rate",
 )
 
 

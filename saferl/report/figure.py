@@ -24,6 +24,7 @@ _TITLES = {
     "return": "return",
     "cost_return": "cost of an episode",
     "lagrange_multiplier": "Lagrange multiplier",
+    "intervention_rate": "interventions of the projector",
 }
 #: Each system keeps its colour, whoever stands beside it; the drivers, which learn nothing, need none.
 _COLOURS = dict(zip(list(LABELS)[2:-1], OTHERS, strict=False)) | {"arsac": EGO}
@@ -87,7 +88,9 @@ def draw(curves: Mapping[str, Mapping[str, Curve]], shaped: list[str], out: Path
         axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(labelsize=8)
-        mean = "since the last record" if name == "lagrange_multiplier" else f"of {WINDOW} episodes"
+        mean = f"of {WINDOW} episodes"
+        if name in ("lagrange_multiplier", "intervention_rate"):
+            mean = "since the last record"
         axes.set_ylabel(f"mean {mean}", fontsize=8)
         axes.set_xlabel("frames", fontsize=8)
     for axes in list(grid.flat)[len(curves) :]:

@@ -93,6 +93,38 @@ class EpisodeWindow:
         self.values = {key: value.clone() for key, value in state.items()}
 
 
+class Means:
+    """Means of scalars by name since they were last taken; no value is fetched from a GPU before.
+
+    >>> means = Means()
+    >>> for loss in (1.0, 3.0):
+    ...     means.add("loss_actor", torch.tensor(loss))
+    >>> means.take(), means.take()
+    ({'loss_actor': 2.0}, {})
+    """
+
+    def __init__(self):
+        self.sums: dict[str, torch.Tensor] = {}
+        self.counts: dict[str, int] = {}
+
+    def add(self, name: str, value: torch.Tensor) -> None:
+        """Take a value, of one element."""
+        self.sums[name] = self.sums.get(name, 0.0) + value.reshape(())
+        self.counts[name] = self.counts.get(name, 0) + 1
+
+    def take(self) -> dict[str, float]:
+        """The means, by name in order; from here on anew."""
+        means = {name: float(self.sums[name]) / self.counts[name] for name in sorted(self.sums)}
+        self.sums, self.counts = {}, {}
+        return means
+
+    def state_dict(self) -> dict:
+        return {"sums": dict(self.sums), "counts": dict(self.counts)}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.sums, self.counts = dict(state["sums"]), dict(state["counts"])
+
+
 class CsvLog:
     """Rows of scalars; a new column rewrites the file's header, so no value is lost."""
 

@@ -26,7 +26,7 @@ from saferl.training.best import BestPolicy
 from saferl.training.learner import Learner
 from saferl.training.limit import CostWatch
 from saferl.training.progress import Budget, Clock, Progress
-from saferl.training.records import CsvLog, EpisodeWindow
+from saferl.training.records import CsvLog, EpisodeWindow, Means
 from saferl.training.watchdog import Watchdog
 
 log = logging.getLogger(__name__)
@@ -125,10 +125,9 @@ class Trainer:
         self.progress, self.clock = Progress(), Clock()
         self.metrics = CsvLog(self.run / "metrics.csv")
         self.timing = CsvLog(self.run / "timing.csv")
-        self._sums: dict[str, Tensor] = {}
+        self.means = Means()
         # Buffers that are to be filled.
         self._empty = set(_not_finite(dict(self.learner.loss.named_buffers())))
-        self._count = 0
         self._loggers: Sequence[Logger] = ()
         self._saved_at = time.monotonic()
         optional = {"watchdog": self.watchdog, "best": self.best}
@@ -143,16 +142,9 @@ class Trainer:
             clock=self.clock,
             window=self.window,
             watch=self.watch,
-            record=self,
+            means=self.means,
             files=GrowingFiles(self.metrics.path, self.timing.path),
         )
-
-    def state_dict(self) -> dict:
-        """Means of the loss terms since the last row."""
-        return {"sums": self._sums, "count": self._count}
-
-    def load_state_dict(self, state: dict) -> None:
-        self._sums, self._count = dict(state["sums"]), state["count"]
 
     def resume(self) -> None:
         """Continue from the newest checkpoint of the run.
@@ -268,7 +260,7 @@ class Trainer:
         Raises:
             ValueError: names the first one.
         """
-        for name in _not_finite(self._sums) + _not_finite(self.learner.loss.state_dict()):
+        for name in _not_finite(self.means.sums) + _not_finite(self.learner.loss.state_dict()):
             if name not in self._empty:
                 raise self._diverged(name)
 
@@ -293,6 +285,8 @@ class Trainer:
         self.learner.schedule(self.spent)
         if self.watchdog is not None:
             self.watchdog.take(data)
+        if (intervened := data.get(("next", "intervened"), None)) is not None:
+            self.means.add("intervention_rate", intervened.float().mean())
         finished = self.window.extend(data)
         progress.frames += data.numel()
         progress.episodes += finished.shape[0]
@@ -305,14 +299,10 @@ class Trainer:
         with self.clock.phase("learn"):
             for batch in self.experience.batches(data, progress.frames):
                 progress.updates += 1
-                self._add(self.learner.update(batch))
+                for name, value in self.learner.update(batch).items():
+                    if value.numel() == 1:
+                        self.means.add(name, value)
         return finished
-
-    def _add(self, losses: TensorDictBase) -> None:
-        for key, value in losses.items():
-            if value.numel() == 1:
-                self._sums[key] = self._sums.get(key, 0.0) + value.reshape(())
-        self._count += 1
 
     def _record(self, data: TensorDictBase) -> None:
         """One row of ``metrics.csv`` (no wall-clock) and one of ``timing.csv``; a look at the critics in the states that were
@@ -324,20 +314,17 @@ class Trainer:
         if self.best is not None:
             counted = {name: getattr(progress, name) for name in ("frames", "episodes", "updates")}
             self.best.look(self.window.values, counted, self._check_finite)
+        for name in _not_finite(self.means.sums):
+            raise self._diverged(name)
         row = {
             "frames": progress.frames,
             "episodes": progress.episodes,
             "updates": progress.updates,
             **self.window.summary(),
-            **{
-                key: float(value) / max(self._count, 1) for key, value in sorted(self._sums.items())
-            },
+            **self.means.take(),
         }
-        for name in _not_finite(self._sums):
-            raise self._diverged(name)
         for group in self.learner.optimizer.param_groups:
             row[f"lr_{group['name']}"] = group["lr"]
-        self._sums, self._count = {}, 0
         self.metrics.write(row)
         seconds = self.clock.seconds
         self.timing.write({"frames": progress.frames, "updates": progress.updates, **seconds})

@@ -128,7 +128,7 @@ def test_every_later_step_is_the_same(algo: str, vehicles: int, scenario: str, t
         if trainer.progress.frames - trainer.progress.last_record >= trainer.record_every:
             trainer._record(data)
     trainer.save()
-    assert trainer._count and trainer.progress.episodes
+    assert trainer.means.counts and trainer.progress.episodes
 
     copy = restored(tmp_path / "a", *options)
     assert_same(everything(trainer), everything(copy))

@@ -33,10 +33,10 @@ def test_nothing_that_is_not_finite_is_kept(tmp_path: Path):
     trainer.save()
     newest = trainer.checkpoint.rotation.latest()
     trainer.progress.frames = 8
-    trainer._sums["loss_qvalue"] = torch.tensor(torch.nan)
+    trainer.means.sums["loss_qvalue"] = torch.tensor(torch.nan)
     with pytest.raises(ValueError, match="loss_qvalue is not finite at frame 8: .*checkpoint-0"):
         trainer.save()
-    trainer._sums.clear()
+    trainer.means.sums.clear()
     trainer.learner.loss.lagrange.value.fill_(torch.inf)
     with pytest.raises(ValueError, match="lagrange.value is not finite at frame 8: .*checkpoint-0"):
         trainer.save()

@@ -51,6 +51,23 @@ def test_random_warm_up_differs_between_environments(tmp_path: Path):
     assert action.abs().max() <= 1 and action.std() > 0.2
 
 
+def test_a_row_tells_how_often_the_projector_acted(tmp_path: Path):
+    """The share of all decisions since the row before, whoever made them."""
+    trainer = trainer_of(tmp_path, "algo=rsac", "projector.limit=0.0", "projector.start=0")
+    for parameter in trainer.learner.loss.parameters():  # before the first update all risks are 0
+        torch.nn.init.normal_(parameter, std=0.1)
+    data = collect(trainer, 3)
+    trainer._record(data[-1])
+    acted = torch.stack([batch["next", "intervened"] for batch in data]).float().mean()
+    assert acted > 0 and trainer.metrics.read()[0]["intervention_rate"] == pytest.approx(acted)
+    trainer._record(collect(trainer, 1)[-1])
+    assert "intervention_rate" in trainer.metrics.read()[1]
+    (tmp_path / "without").mkdir()
+    without = trainer_of(tmp_path / "without", "algo=sac")
+    without._record(collect(without, 1)[-1])
+    assert "intervention_rate" not in without.metrics.read()[0]
+
+
 def test_demonstrations_fill_the_buffer_before_the_first_frame(tmp_path: Path):
     options = (
         "algo=arsac",
@@ -250,10 +267,10 @@ def test_records(tmp_path: Path):
     """Rows at the frames they are due, means of what lies between, no wall-clock among them."""
     trainer = trainer_of(tmp_path, "algo=arsac", "record_every=10", "logger=tensorboard")
     means: dict[str, list[float]] = {"loss_qvalue": []}
-    add = trainer._add
-    trainer._add = lambda losses: (
-        means["loss_qvalue"].append(float(losses["loss_qvalue"])),
-        add(losses),
+    add = trainer.means.add
+    trainer.means.add = lambda name, value: (
+        means.setdefault(name, []).append(float(value)),
+        add(name, value),
     )
     trainer.train()
     with (tmp_path / "metrics.csv").open() as file:

@@ -59,7 +59,7 @@ def test_a_divergence_says_which_critic_left_first(tmp_path: Path):
     trainer.save()
     trainer.progress.frames = 99
     trainer.watchdog.left = {"qvalue_network": 80, "cost_critic": 40}
-    trainer._sums["loss_qvalue"] = torch.tensor(torch.nan)
+    trainer.means.sums["loss_qvalue"] = torch.tensor(torch.nan)
     with pytest.raises(
         ValueError, match=r"diverged\. cost_critic had left its range at frame 40\."
     ):
