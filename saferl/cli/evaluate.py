@@ -23,6 +23,7 @@ from saferl.algorithms.assemble import build_env
 from saferl.algorithms.parts import device_of, make, offered
 from saferl.algorithms.policy import compiling, trained_agent
 from saferl.checkpoint.run import run_config
+from saferl.cli.again import asked, is_there, keep
 from saferl.cli.launch import job_folder
 from saferl.config.check import check_targets
 from saferl.config.locate import pretrained_run
@@ -137,8 +138,11 @@ def evaluate(cfg: DictConfig) -> None:
     title = f"{who.name.partition(' ')[0]}-{task.task}-seed{cfg.seed}"
     folder = f"evaluation/{title}/{datetime.now():%Y-%m-%d_%H-%M-%S-%f}"
     out = job_folder() or Path(folder if cfg.out is None else str(cfg.out))
-    if (out / "metrics.json").exists():
-        raise ValueError(f"out: {out} holds a test already; take another folder.")
+    test = asked(cfg) if job_folder() else None
+    if is_there(out, test):
+        log.info("%s is there already.", out)
+        return
+    keep(out, test, finished=False)
     rows = measure(
         cfg.env,
         task,
@@ -153,6 +157,7 @@ def evaluate(cfg: DictConfig) -> None:
     pictures(cfg.env, task, who, drawn(rows, cfg), out, cfg.device, cfg.draw_format)
     if isinstance(task, Scenario):
         look_into(cfg, task, who, rows, out)
+    keep(out, test, finished=True)
 
 
 def look_into(cfg: DictConfig, task: Scenario, who: Candidate, rows: list[dict], out: Path) -> None:

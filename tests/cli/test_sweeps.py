@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from pathlib import Path
@@ -88,6 +89,27 @@ def test_tests_of_a_sweep_end_with_one_table_and_those_before_stand_in_it(
     )
     summarise(["tests"])
     assert capsys.readouterr().out.splitlines() == [head, *lines]
+
+
+def test_a_sweep_of_tests_that_is_run_again_does_what_is_missing(command, tmp_path: Path, capsys):
+    """A test that was cut short is done again; another one in its folder is refused."""
+    sweep = (*TEST, "-m", *EMPTY, "policy=blind,random", "task=rt", "out=tests")
+    command(*sweep, "episodes=1")
+    kept, again = (tmp_path / f"tests/policy-{name}" for name in ("blind", "random"))
+    told = json.loads((again / "asked.json").read_text())
+    assert told["finished"]
+    (again / "asked.json").write_text(json.dumps(told | {"finished": False}))
+    for folder in (kept, again):
+        (folder / "episodes.csv").write_text("mine")
+    capsys.readouterr()
+    command(*sweep, "episodes=1", "env.num_envs=1")
+    assert "policy-blind is there already" in capsys.readouterr().out
+    assert (kept / "episodes.csv").read_text() == "mine"
+    assert (again / "episodes.csv").read_text() != "mine"
+    with pytest.raises(SystemExit):
+        command(*sweep, "episodes=2")
+    assert "holds a test already" in (kept / "error.txt").read_text()
+    assert (kept / "episodes.csv").read_text() == "mine"
 
 
 def test_one_refused_job_of_a_sweep_stops_no_other(command, tmp_path: Path, capsys):
