@@ -23,6 +23,10 @@ def main(arguments: list[str] | None = None) -> None:
         "--play", type=int, default=0, metavar="N",
         help="let each system play N episodes of one test again for report.html, crashes first (0)",
     )  # fmt: skip
+    parser.add_argument(
+        "--numbers", type=Path, metavar="FOLDER",
+        help="keep there what a report reads of each finished run, to publish it, or to add runs to it later",
+    )  # fmt: skip
     given = parser.parse_args(arguments)
     if given.play < 0:
         raise SystemExit(f"error: --play must be >= 0, got {given.play}.")
@@ -32,6 +36,7 @@ def main(arguments: list[str] | None = None) -> None:
     from saferl.report.build import build
     from saferl.report.files import write
     from saferl.report.html import write_page
+    from saferl.report.numbers import publish
     from saferl.report.text import states, verdicts
     from saferl.report.traces import lying, made
 
@@ -45,6 +50,8 @@ def main(arguments: list[str] | None = None) -> None:
         if report.runs:
             print(f"Runs: {states(report.runs)}.\nClaims: {verdicts(report.claims)}.")
             print(write(report, given.out), flush=True)
+        if given.numbers is not None:
+            print(f"{given.numbers}: {len(publish(report.runs, given.numbers))} runs.")
         made_now = made(report.runs, given.play, given.out / "traces", given.out / "drivers")
         print(write_page(report, [*made_now, *traces], given.out / "report.html"))
     except (ValueError, OSError) as error:

@@ -18,7 +18,8 @@ from saferl.report.claims import CONFIRMED, NO_DATA, OPEN, REFUTED
 from saferl.report.command import main
 from saferl.report.curves import band
 from saferl.report.files import write
-from saferl.report.runs import FIGURES, FINISHED
+from saferl.report.numbers import publish
+from saferl.report.runs import FIGURES, FINISHED, find
 from saferl.report.systems import CONDITIONS
 from saferl.report.tables import printed
 from saferl.report.text import latex, markdown, sentence, table_grid
@@ -242,3 +243,18 @@ def test_runs_that_have_only_begun_make_a_report_too(tmp_path: Path):
     text = write(done, tmp_path / "out").read_text()
     assert "1 interrupted" in text and {claim.verdict for claim in done.claims} == {NO_DATA}
     assert not done.systems and not done.curves
+
+
+def test_published_numbers_make_the_same_report(report, tmp_path: Path):
+    """Without the runs; what lies there already is kept, and runs may stand beside it."""
+    made = publish(report[0].runs, tmp_path / "numbers")
+    assert len(made) == sum(map(len, CRASHES.values()))
+    assert not any("foreign" in path.name for path in made)
+    again = build([tmp_path / "numbers"], report[1])
+    assert again.tables == report[0].tables and again.efforts == report[0].efforts
+    assert [str(claim) for claim in again.claims] == [str(claim) for claim in report[0].claims]
+    assert {run.state for run in again.runs} == {FINISHED}
+    mine = make(tmp_path / "mine", "asac", 3, [0], 12.0, ["task.vehicles=0"])
+    more = find([tmp_path / "numbers", mine])
+    assert publish(more, tmp_path / "numbers") == [tmp_path / "numbers/asac/seed3"]
+    assert "runs" not in (tmp_path / "numbers/sac/seed0/config.yaml").read_text()
