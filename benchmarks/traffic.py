@@ -8,27 +8,39 @@ share of episodes in which surrounding vehicles overlap each other, and the shar
 stands before or in the box when the time is over although nothing but traffic rules holds it. The
 drivers: ``blind`` follows its lane, ``cautious`` looks ahead, ``parked`` stands at its start.
 Wanted: blind collisions >= 25%, cautious success >= 90%, parked collisions < 1%, overlaps < 1%,
-stuck < 1%. Vehicles leave the road 100 m behind the box and nowhere else.
+stuck < 1%. Vehicles leave the road 100 m behind the box and nowhere else. On SUMO every episode is a process.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from tensordict import TensorDict
 
-from saferl.envs.intersection import SCENARIOS, BatchedIntersection, HighwayIntersection, Scenario
-from saferl.envs.intersection.batched import vehicles_of
+from saferl.envs.intersection import (
+    SCENARIOS,
+    BatchedIntersection,
+    HighwayIntersection,
+    IntersectionBase,
+    Scenario,
+    SumoIntersection,
+)
+from saferl.envs.intersection.batched import TensorIntersection
 from saferl.envs.intersection.collision_cost import CollisionCost
 from saferl.envs.intersection.drivers import CautiousDriver, Driver
 from saferl.envs.intersection.geometry import LENGTH, separation
 from saferl.envs.intersection.roads import lane_frames, lanes
+from saferl.envs.intersection.sumo_net import MANNERS
 from saferl.envs.intersection.traffic import Vehicles
 
+ENVS = {"batched": BatchedIntersection, "highway": HighwayIntersection}
+ENVS |= {f"sumo-{name}": partial(SumoIntersection, drivers=name) for name in MANNERS}
 DRIVERS = {"blind": Driver(), "cautious": CautiousDriver(), "parked": None}
 
 
@@ -48,23 +60,17 @@ def stuck(vehicles: Vehicles, ego_route: torch.Tensor) -> np.ndarray:
     return (standing & (lane.approach != own.approach)).any(0).numpy()
 
 
-def traffic(env: BatchedIntersection | HighwayIntersection) -> Vehicles:
-    """The surrounding vehicles of every episode, each [N, episodes]."""
-    if isinstance(env, BatchedIntersection):
-        return vehicles_of(env._state)
-    every = zip(*(one.road.surrounding for one in env.envs), strict=True)
-    return Vehicles(*(torch.stack(values, -1) for values in every))
-
-
-def park(env: BatchedIntersection | HighwayIntersection) -> None:
-    if isinstance(env, BatchedIntersection):
+def park(env: IntersectionBase) -> None:
+    if isinstance(env, TensorIntersection):
         env._state["ego"][:, 2] = 0.0
         return
     for one in env.envs:
         one.ego.place(one.ego.state * torch.tensor([1, 1, 0, 0, 1, 0]))
 
 
-def play(kind: type, scenario: Scenario, driver: str, episodes: int) -> dict[str, float]:
+def play(
+    kind: Callable[..., IntersectionBase], scenario: Scenario, driver: str, episodes: int
+) -> dict[str, float]:
     env = kind(scenario, num_envs=episodes, seed=0)
     td = env.reset()
     if driver == "parked":
@@ -77,7 +83,7 @@ def play(kind: type, scenario: Scenario, driver: str, episodes: int) -> dict[str
         else:
             td = DRIVERS[driver](td)
         td = env.step(td)["next"]
-        now, alive = traffic(env), ~done.squeeze(-1).numpy()
+        (_, now), alive = env.scene(), ~done.squeeze(-1).numpy()
         overlap |= overlapping(now) & alive
         held = np.where(alive, stuck(now, td["route"].squeeze(-1)), held)
         # What an episode ended with; a batched one is driven on, and ignored.
@@ -85,6 +91,7 @@ def play(kind: type, scenario: Scenario, driver: str, episodes: int) -> dict[str
         done = done | td["done"]
         if done.all():
             break
+    env.close()
     return summary(last, overlap, held)
 
 
@@ -102,7 +109,7 @@ def summary(td: TensorDict, overlap: np.ndarray, held: np.ndarray) -> dict[str, 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--env", choices=("batched", "highway"), default="batched")
+    parser.add_argument("--env", choices=list(ENVS), default="batched")
     parser.add_argument("--episodes", type=int, default=1000)
     parser.add_argument("--tasks", nargs="+", default=["lt", "gs", "rt"])
     parser.add_argument("--drivers", nargs="+", default=list(DRIVERS), choices=list(DRIVERS))
@@ -111,7 +118,6 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the figures here")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    kind = BatchedIntersection if options.env == "batched" else HighwayIntersection
     results = {}
     for task in options.tasks:
         for driver in options.drivers:
@@ -119,7 +125,7 @@ def main() -> None:
                 task=task, scenario=options.scenario, policy_frequency=options.frequency,
                 cost=CollisionCost(steps=1),  # not looked at here
             )  # fmt: skip
-            figures = play(kind, scenario, driver, options.episodes)
+            figures = play(ENVS[options.env], scenario, driver, options.episodes)
             results[f"{task}/{driver}"] = figures
             row = "  ".join(f"{name} {100 * value:5.1f}%" for name, value in figures.items())
             print(f"{task} {driver:8s}  {row}", flush=True)

@@ -6,6 +6,8 @@ No generator is shared: what happens in an episode follows from its own 31-bit s
 from __future__ import annotations
 
 import secrets
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -126,9 +128,14 @@ class ReplayedEnv(SeededEnv):
 
     An episode that has ended stands still until its reset, so that playing a batch to its last end costs
     nothing more. The state is the seeds and the actions of the running episodes, which are played again. A
-    subclass calls :meth:`_make_ends`, then :meth:`_make_memory`, and defines :meth:`_start`, :meth:`_advance`
-    and :meth:`_stack`.
+    subclass calls :meth:`_make_ends`, then :meth:`_make_memory`, and defines :meth:`_start` and :meth:`_advance`,
+    or, where several go on at once, :meth:`_start_all` and :meth:`_advance_all`; and :meth:`_stack`.
+
+    Attributes:
+        made_with: what the constructor of a copy is given besides task, number and device.
     """
+
+    made_with: Mapping[str, Any] = MappingProxyType({})
 
     def _make_memory(self) -> None:
         count = self.batch_size[0]
@@ -149,14 +156,26 @@ class ReplayedEnv(SeededEnv):
         """The last of each environment [B, ...], with reward, cost and ends after a step."""
         raise NotImplementedError
 
-    def _reset_one(self, index: int) -> None:
-        self._actions[index] = []
-        self._last[index] = self._start(index, int(self._seeds[index]))
+    def _start_all(self, seeds: dict[int, int]) -> dict[int, dict[str, Any]]:
+        """What these environments show at the start of their episodes: :meth:`_start` of each."""
+        return {index: self._start(index, seed) for index, seed in seeds.items()}
 
-    def _step_one(self, index: int, action: np.ndarray) -> None:
-        if not self._last[index].get("done"):
+    def _advance_all(self, actions: dict[int, np.ndarray]) -> dict[int, dict[str, Any]]:
+        """What these environments show after an action of each: :meth:`_advance` of each."""
+        return {index: self._advance(index, action) for index, action in actions.items()}
+
+    def _begin(self, rows: list[int]) -> None:
+        for index in rows:
+            self._actions[index] = []
+        for index, shown in self._start_all({i: int(self._seeds[i]) for i in rows}).items():
+            self._last[index] = shown
+
+    def _go_on(self, actions: dict[int, np.ndarray]) -> None:
+        going = {i: action for i, action in actions.items() if not self._last[i].get("done")}
+        for index, action in going.items():
             self._actions[index].append(action)
-            self._last[index] = self._advance(index, action)
+        for index, shown in self._advance_all(going).items():
+            self._last[index] = shown
 
     def _reset(
         self, tensordict: TensorDictBase | None = None, seeds: Tensor | None = None, **kwargs
@@ -165,21 +184,20 @@ class ReplayedEnv(SeededEnv):
         self._seeds = torch.where(
             reset, self._next_seeds(reset, seeds), self._seeds.to(reset.device)
         ).cpu()
-        for index in reset.nonzero().flatten().tolist():
-            self._reset_one(index)
+        self._begin(reset.nonzero().flatten().tolist())
         return self._stack(ended=False)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict.get("action").cpu()
         if not actions.isfinite().all():  # what follows would look like a fault of the environment
             raise ValueError("the policy gave an action that is not finite.")
-        for index, action in enumerate(actions.numpy()):
-            self._step_one(index, action.copy())
+        self._go_on(dict(enumerate(actions.numpy().copy())))
         return self._stack(ended=True)
 
     def __reduce__(self) -> tuple:
         """A copy is made anew and plays the running episodes again: simulators can rarely be copied or pickled."""
-        return _again, (type(self), self.task, self.batch_size[0], self.device, self.state_dict())
+        settings = {"device": self.device, **self.made_with}
+        return _again, (type(self), self.task, self.batch_size[0], settings, self.state_dict())
 
     def __deepcopy__(self, memo: dict) -> ReplayedEnv:
         function, arguments = self.__reduce__()
@@ -198,12 +216,12 @@ class ReplayedEnv(SeededEnv):
         super().load_state_dict(state_dict)
         self._seeds = state_dict["seeds"].cpu().clone()
         for index in range(self.batch_size[0]):
-            self._reset_one(index)
+            self._begin([index])
             for action in state_dict[f"actions_{index}"].cpu().numpy():
-                self._step_one(index, action.copy())
+                self._go_on({index: action.copy()})
 
 
-def _again(kind: type[ReplayedEnv], task: Any, num_envs: int, device: Any, state: Any) -> Any:
-    env: Any = kind(task, num_envs, device=device)
+def _again(kind: Any, task: Any, num_envs: int, settings: dict[str, Any], state: Any) -> Any:
+    env = kind(task, num_envs, **settings)
     env.load_state_dict(state)
     return env

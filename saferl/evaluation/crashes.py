@@ -65,10 +65,11 @@ class _TakesOver(TensorDictModuleBase):
         return tensordict.set("action", action)
 
 
-def _survives(
+def _crash(
     scenario: Scenario, seeds: Tensor, actions: Tensor, until: Tensor, cautious: Tensor
 ) -> Tensor:
-    """Whether no crash comes in each episode [B] where another driver takes over at ``until``, as far as is looked."""
+    """The decision in which a crash comes in each episode [B] where another driver takes over at ``until``, counted from 1,
+    and 0 where none comes as far as is looked."""
     longest = actions.shape[1] / scenario.policy_frequency + AFTER
     scenario = dataclasses.replace(scenario, duration=min(scenario.duration, longest))
     ends = []
@@ -80,7 +81,7 @@ def _survives(
             [step["next", "collision"] | step["next", "offroad"] for step in steps]
         )
         alive = torch.stack([step["alive"] for step in steps])
-        ends.append(~(crashed.squeeze(-1) & alive).any(0))
+        ends.append(torch.where((crashed.squeeze(-1) & alive).any(0), alive.sum(0), 0))
     return torch.cat(ends)
 
 
@@ -98,7 +99,7 @@ def explain(trace: Trace, scenario: Scenario) -> list[dict[str, Any]]:
         the limit; ``corrected``: the share of the decisions from then on that the projector changed; ``braking`` and
         ``cautious``: how many seconds before the crash, at most 5, the last moment lay from which braking along the lane, or the
         cautious driver, would have come without a crash to 5 s after the last of these crashes, in the batched simulator. None where there is none. A replay that does not end
-        in a crash by itself, as it may for an episode of highway-env, has neither.
+        in the same decision by itself, as of an episode with SUMO's drivers, has neither.
     """
     dt, limit = trace.about["dt"], trace.about.get("risk_limit")
     kinds = trace.episodes["outcome"]
@@ -157,16 +158,16 @@ def _saved(
     cautious = torch.arange(len(back)) > len(MOMENTS)
     variants = len(back)
     seeds = torch.tensor([row["seed"] for row in crashes])
-    survives = _survives(
+    crash = _crash(
         scenario,
         seeds.repeat_interleave(variants),
         played.repeat_interleave(variants, 0),
         until.flatten(),
         cautious.repeat(len(crashes)),
     ).reshape(len(crashes), variants)
-    possible = (until >= 0) & ~survives[:, :1]
+    possible = (until >= 0) & (crash[:, :1] == length[:, None])
     results = []
-    for alive in (survives & possible).tolist():
+    for alive in ((crash == 0) & possible).tolist():
         by = {"braking": alive[1 : len(MOMENTS) + 1], "cautious": alive[len(MOMENTS) + 1 :]}
         results.append(
             {

@@ -47,7 +47,7 @@ def test_option_composes_and_is_checked(option: str):
     check(compose(option, *BESIDE.get(option, ())))
 
 
-ROADS = {"task": ["gs", "lt", "mixed", "rt"], "env": ["batched", "highway"]}
+ROADS = {"task": ["gs", "lt", "mixed", "rt"], "env": ["batched", "highway", "sumo"]}
 
 
 @pytest.mark.parametrize("option", [f"{group}={name}" for group in ROADS for name in ROADS[group]])

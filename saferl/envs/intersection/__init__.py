@@ -1,4 +1,4 @@
-"""The intersection of the paper as a constrained Markov decision process, on two backends.
+"""The intersection of the paper as a constrained Markov decision process, on three backends.
 
 The batched road stands alone; highway-env is imported with the first use of what is built on it.
 """
@@ -12,6 +12,7 @@ from saferl.envs.intersection.collision_cost import CollisionCost
 from saferl.envs.intersection.registration import register
 from saferl.envs.intersection.reward import Reward
 from saferl.envs.intersection.spawning import SCENARIOS, Traffic
+from saferl.envs.intersection.sumo import SumoIntersection
 
 if TYPE_CHECKING:
     from saferl.envs.intersection.highway import IntersectionEnv
@@ -26,6 +27,7 @@ __all__ = [
     "IntersectionEnv",
     "Reward",
     "Scenario",
+    "SumoIntersection",
     "Traffic",
     "register",
 ]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -141,26 +142,50 @@ def advance(scenario: Scenario, state: State, action: Tensor) -> tuple[State, St
     Returns:
         The next state; and outcomes, ``reward``, ``cost`` and ends, each [B].
     """
-    # Laid out like the rest: the action that comes in is not.
-    control = columns(*to_physical(action).unbind(-1))
-    ego, route, steps, vehicles = state["ego"], state["route"], state["steps"], vehicles_of(state)
-    previous = torch.where(steps[:, None] == 0, control, state["control"])
+    ego, steps, vehicles = state["ego"], state["steps"], vehicles_of(state)
     lane, own_lane = _lanes(state, _LANE), _lanes(state, _OWN)
     pair = state["pair"].movedim(0, -1)
     zone = state["zone_begin"].movedim(0, -1), state["zone_end"].movedim(0, -1)
-    cost = scenario.cost(ego, control, vehicle_states(vehicles, lane), state["within_view"])
-
     time = steps.to(ego.dtype) / scenario.policy_frequency
-    traffic = scenario.traffic.vehicles[1] > 0
-    if traffic:
+    if scenario.traffic.vehicles[1] > 0:
         ruled = road_rules(vehicles, lane, own_lane, zone, ego, time)
         every = scenario.rules_every
         vehicles = ruled if every == 1 else _choose(steps % every == 0, ruled, vehicles)
+
+    def moved(vehicles: Vehicles, ego: Tensor, substep: int) -> Vehicles:
+        return move(vehicles, lane, accelerate(vehicles, lane, pair, ego), scenario.dt)
+
+    return drive(scenario, state, action, vehicles, moved)
+
+
+def drive(
+    scenario: Scenario,
+    state: State,
+    action: Tensor,
+    vehicles: Vehicles,
+    moved: Callable[[Vehicles, Tensor, int], Vehicles],
+) -> tuple[State, State]:
+    """A decision of every ego, and what comes of it, among vehicles that somebody else moves.
+
+    Args:
+        scenario, state, action: as of :func:`advance`.
+        vehicles: where they begin, each [N, B].
+        moved: of vehicles and egos [B, 6] before a substep and its number: the vehicles after it.
+
+    Returns:
+        As :func:`advance`.
+    """
+    # Laid out like the rest: the action that comes in is not.
+    control = columns(*to_physical(action).unbind(-1))
+    ego, route, steps, lane = state["ego"], state["route"], state["steps"], _lanes(state, _LANE)
+    previous = torch.where(steps[:, None] == 0, control, state["control"])
+    others = vehicle_states(vehicles_of(state), lane)
+    cost = scenario.cost(ego, control, others, state["within_view"])
+    traffic = scenario.traffic.vehicles[1] > 0
     collision = torch.zeros_like(steps, dtype=torch.bool)
-    for _ in range(SUBSTEPS):  # a collision ends a decision at once
+    for substep in range(SUBSTEPS):  # a collision ends a decision at once
         if traffic:
-            moved = move(vehicles, lane, accelerate(vehicles, lane, pair, ego), scenario.dt)
-            vehicles = _choose(collision, vehicles, moved)
+            vehicles = _choose(collision, vehicles, moved(vehicles, ego, substep))
         ego = torch.where(collision[:, None], ego, step_ego(ego, control, scenario.dt))
         if traffic:
             place, _ = lane_frames(lane, vehicles.s)
@@ -193,7 +218,28 @@ def advance(scenario: Scenario, state: State, action: Tensor) -> tuple[State, St
     }  # fmt: skip
 
 
-class BatchedIntersection(IntersectionBase):
+class TensorIntersection(IntersectionBase):
+    """An intersection whose scenes are one state of tensors, as :func:`begin` gives."""
+
+    _state: State
+
+    def _observation(self) -> State:
+        seen = {"ego": "seen_ego", "vehicles": "seen_vehicles", "route": "route"}
+        return {key: self._state[name] for key, name in seen.items()}
+
+    def scene(self) -> tuple[Tensor, Vehicles]:
+        """The true states of the egos [B, 6], and the surrounding vehicles [N, B], seen or not."""
+        return self._state["ego"], vehicles_of(self._state)
+
+    def render(self, index: int) -> np.ndarray:
+        """The scene [600, 600, 3] uint8 of one environment, drawn by highway-env's graphics."""
+        from saferl.envs.intersection.rendering import draw_state  # late: needs pygame
+
+        state = {key: value[index].cpu() for key, value in self._state.items()}
+        return draw_state(state["ego"], int(state["route"]), vehicles_of(state))
+
+
+class BatchedIntersection(TensorIntersection):
     """The CMDP with traffic, B environments in one set of tensors, on CPU or GPU.
 
     Args:
@@ -227,10 +273,6 @@ class BatchedIntersection(IntersectionBase):
         self._chunk = max(min(num_envs, 32), num_envs // 8)
         self._state: State = {}
 
-    def _observation(self) -> State:
-        seen = {"ego": "seen_ego", "vehicles": "seen_vehicles", "route": "route"}
-        return {key: self._state[name] for key, name in seen.items()}
-
     def _reset(
         self, tensordict: TensorDictBase | None = None, seeds: Tensor | None = None, **kwargs
     ) -> TensorDictBase:
@@ -248,17 +290,6 @@ class BatchedIntersection(IntersectionBase):
         action = tensordict["action"].to(self._state["ego"])
         self._state, output = self._advance(self._state, action)
         return self._output(self._observation() | output)
-
-    def scene(self) -> tuple[Tensor, Vehicles]:
-        """The true states of the egos [B, 6], and the surrounding vehicles [N, B], seen or not."""
-        return self._state["ego"], vehicles_of(self._state)
-
-    def render(self, index: int) -> np.ndarray:
-        """The scene [600, 600, 3] uint8 of one environment, drawn by highway-env's graphics."""
-        from saferl.envs.intersection.rendering import draw_state  # late: needs pygame
-
-        state = {key: value[index].cpu() for key, value in self._state.items()}
-        return draw_state(state["ego"], int(state["route"]), vehicles_of(state))
 
     def state_dict(self, *args, **kwargs) -> dict[str, Tensor]:
         """Everything that decides what comes next: vehicle states and episode sequences."""
