@@ -45,11 +45,13 @@ def run(tmp_path_factory) -> Path:
     [
         ["highway", *SHORT],
         ["simulation", "--batches", "4", *SHORT],
+        ["worlds", "--batches", "2", *SHORT],
         ["projector", "--batches", "2", "--width", "16", "--steps", "10", *SHORT],
         ["update", "--width", "16", "--batch", "8", *SHORT],
         ["threads", "--algos", "sac_lag", "--spins", "default", "--width", "16", *SHORT],
         ["training", "--algos", "sac_lag", "--episodes", "20", "--set", *FAST],
         ["traffic", "--episodes", "5"],
+        ["traffic", "--env", "sumo-imperfect", "--episodes", "2"],
         ["oracle", "--episodes", "2"],
         ["two_checkouts", ".", "--runs", "algo=sac encoder.width=16", "--modes", "eager", "--batch", "8",
          *SHORT],

@@ -48,7 +48,7 @@ def test_termination_on_the_last_step_stays_a_termination():
     env.reset()
     env.envs[0].unwrapped.place[:] = 0.0
     for _ in range(5):
-        env._step_one(0, np.ones(1, np.float32))
+        env._go_on({0: np.ones(1, np.float32)})
     assert env._last[0]["terminated"] and env._last[0]["truncated"] and len(env._actions[0]) == 5
 
 

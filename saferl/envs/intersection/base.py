@@ -28,7 +28,7 @@ from saferl.envs.intersection.roads import lanes
 from saferl.envs.intersection.spawning import SCENARIOS, Traffic, draw_route
 from saferl.envs.intersection.traffic import Vehicles, vehicle_states
 from saferl.envs.intersection.yielding import PERIOD
-from saferl.envs.seeding import SeededEnv
+from saferl.envs.seeding import ReplayedEnv, SeededEnv
 from saferl.envs.task import Task
 
 SUBSTEPS = 3
@@ -319,3 +319,14 @@ class IntersectionBase(SeededEnv):
     def render(self, index: int) -> np.ndarray | None:
         """A picture [H, W, 3] uint8 of one environment, or None where a backend draws none."""
         return None
+
+
+class ReplayedIntersection(ReplayedEnv, IntersectionBase):
+    """An intersection whose state is the seeds and actions of its episodes; what it shows is kept by the specs' keys."""
+
+    def _stack(self, ended: bool) -> TensorDict:
+        keys = ("ego", "vehicles", "route", *OUTCOMES)
+        if ended:
+            keys += ("reward", "cost", "terminated", "truncated", "done")
+        rows = {key: [torch.as_tensor(last[key]) for last in self._last] for key in keys}
+        return self._output({k: torch.stack(v).to(self.device or "cpu") for k, v in rows.items()})

@@ -6,17 +6,15 @@ import dataclasses
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
-from saferl.envs.intersection.base import OUTCOMES, IntersectionBase, Scenario
+from saferl.envs.intersection.base import OUTCOMES, ReplayedIntersection, Scenario
 from saferl.envs.intersection.geometry import ROUTES
 from saferl.envs.intersection.highway import IntersectionEnv
 from saferl.envs.intersection.traffic import Vehicles
-from saferl.envs.seeding import ReplayedEnv
 
 
-class HighwayIntersection(ReplayedEnv, IntersectionBase):
+class HighwayIntersection(ReplayedIntersection):
     """``num_envs`` highway-env intersections, stepped one after the other in this process.
 
     Same specs, keys, units and seeds as :class:`BatchedIntersection`. For several processes wrap it in
@@ -39,18 +37,6 @@ class HighwayIntersection(ReplayedEnv, IntersectionBase):
         settings = {name: getattr(task, name) for name in fields}
         self.envs = [IntersectionEnv(**settings, render_mode="rgb_array") for _ in range(num_envs)]
         self._make_memory()
-
-    def _stack(self, ended: bool) -> TensorDictBase:
-        keys = ("ego", "vehicles", "route", *OUTCOMES)
-        if ended:
-            keys += ("reward", "cost", "terminated", "truncated", "done")
-        values = {
-            key: torch.from_numpy(np.stack([np.asarray(last[key]) for last in self._last]))
-            for key in keys
-        }
-        if "reward" in values:
-            values |= {key: values[key].float() for key in ("reward", "cost")}
-        return self._output({key: value.to(self.device or "cpu") for key, value in values.items()})
 
     @staticmethod
     def _entry(observation: dict, info: dict) -> dict:

@@ -19,10 +19,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
-from saferl.envs.intersection.base import OUTCOMES, SUBSTEPS, Scenario
+from saferl.envs.intersection.base import OUTCOMES, SUBSTEPS, ReplayedIntersection, Scenario
 from saferl.envs.intersection.batched import (
     State,
     TensorIntersection,
@@ -36,7 +35,6 @@ from saferl.envs.intersection.roads import MOVEMENTS, lane_project, lanes
 from saferl.envs.intersection.sumo_net import MANNERS, network, traffic
 from saferl.envs.intersection.sumo_worker import Car, Pose, Seen
 from saferl.envs.intersection.traffic import Vehicles
-from saferl.envs.seeding import ReplayedEnv
 
 _WORKER = Path(__file__).with_name("sumo_worker.py")
 
@@ -49,8 +47,8 @@ def installed() -> bool:
 def poses(ego: Tensor) -> list[Pose]:
     """States [..., 6] of the ego as SUMO's poses: of its front bumper, y up, degrees clockwise from the north.
 
-    >>> poses(torch.tensor([[2.0, 50.0, 9.0, 0.0, -math.pi / 2, 0.0]]))
-    [(2.0, -47.5, 0.0)]
+    >>> poses(torch.tensor([[2.0, 50.0, 9.0, 0.0, 0.0, 0.0]]))  # eastwards
+    [(4.5, -50.0, 90.0)]
     """
     x, y, phi = ego[..., 0], ego[..., 1], ego[..., 4]
     front = x + LENGTH / 2 * torch.cos(phi), -(y + LENGTH / 2 * torch.sin(phi))
@@ -93,7 +91,7 @@ def placed(vehicles: Vehicles, seen: list[Seen]) -> Vehicles:
     )
 
 
-class SumoIntersection(ReplayedEnv, TensorIntersection):
+class SumoIntersection(ReplayedIntersection, TensorIntersection):
     """``num_envs`` intersections with SUMO's drivers, each simulation in a process of its own.
 
     Same specs, keys, units and seeds as :class:`BatchedIntersection`; an episode of a seed begins with the same scene.
@@ -146,7 +144,10 @@ class SumoIntersection(ReplayedEnv, TensorIntersection):
         """What the simulations of some environments answer, which work side by side."""
         for index, arguments in each.items():
             self._connections[index].send((name, arguments))
-        answers = [self._connections[index].recv() for index in each]
+        try:
+            answers = [self._connections[index].recv() for index in each]
+        except EOFError:
+            raise RuntimeError(f"a process of SUMO has died in {name}.") from None
         for done, answer in answers:
             if not done:
                 raise RuntimeError(f"SUMO failed in {name}: {answer}")
@@ -214,13 +215,6 @@ class SumoIntersection(ReplayedEnv, TensorIntersection):
             if joins[:, place].any()
         }
         self._ask("enter", entering)
-
-    def _stack(self, ended: bool) -> TensorDictBase:
-        keys = ("ego", "vehicles", "route", *OUTCOMES)
-        if ended:
-            keys += ("reward", "cost", "terminated", "truncated", "done")
-        values = {key: torch.stack([last[key] for last in self._last]) for key in keys}
-        return self._output({key: value.to(self.device or "cpu") for key, value in values.items()})
 
     def close(self, **kwargs) -> None:
         """End the simulations' processes."""

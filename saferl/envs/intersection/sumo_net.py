@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import subprocess
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -59,17 +59,17 @@ def _tag(name: str, **attributes: object) -> str:
     return f"<{name}{said}/>"
 
 
-def _shape(route: int, begin: float, end: float, points: int = 2) -> str:
-    """The middle line of a route between two arc lengths, m, as SUMO writes it."""
-    s = torch.linspace(begin, end, points, dtype=torch.float64)
-    place, _ = lane_frames(lanes(torch.tensor(route), s), s)
+def _through_the_box(route: int) -> str:
+    """The middle line of a route through the box, as SUMO writes it."""
+    lane = lanes(torch.tensor(route), torch.zeros(1, dtype=torch.float64))
+    place, _ = lane_frames(lane, torch.linspace(ARM, float(lane.out), _POINTS).double())
     return " ".join(f"{x:.3f},{-y:.3f}" for x, y in zip(place.x, place.y, strict=True))
 
 
 def plain() -> dict[str, str]:
     """Nodes, edges and connections as netconvert reads them, by the endings of their files' names.
 
-    >>> plain()["edg"].count("<edge"), plain()["con"].count("<connection")
+    >>> plain()["edg"].count("<edge "), plain()["con"].count("<connection ")
     (8, 16)
     """
     corners = ((-1, -1), (1, -1), (1, 1), (-1, 1))
@@ -92,11 +92,10 @@ def plain() -> dict[str, str]:
             )
     for route in range(4 * len(PRIORITIES)):
         movement, lane = MOVEMENTS[route % 4]
-        out = float(lanes(torch.tensor(route), torch.zeros((), dtype=torch.float64)).out)
         begin, end = edges_of(route)
         connections.append(
             _tag("connection", from_=begin, to=end, fromLane=1 - lane, toLane=1 - lane, speed=TURN_SPEED[movement],
-                 shape=_shape(route, ARM, out, _POINTS))
+                 shape=_through_the_box(route))
         )  # fmt: skip
     groups = {"nod": ("nodes", nodes), "edg": ("edges", edges), "con": ("connections", connections)}
     return {
@@ -131,13 +130,13 @@ def cars(manners: Manners) -> str:
     return "\n".join(["<routes>", *lines, "</routes>"])
 
 
-@lru_cache(maxsize=1)
+@cache
 def _folder() -> TemporaryDirectory:
     """This process's own, gone when it ends."""
     return TemporaryDirectory(prefix="saferl-sumo-")
 
 
-@lru_cache(maxsize=1)
+@cache
 def network() -> Path:
     """The network, made once for each process.
 

@@ -1,7 +1,8 @@
 """SUMO's simulations, each in a process of its own, as libsumo holds one for each process.
 
 Run as a program by :mod:`saferl.envs.intersection.sumo`, with the file descriptors of as many connections as it wants
-simulations. It needs libsumo and nothing of saferl, so that messages are of plain numbers. Positions are SUMO's: of the middle of the front bumper, m, y up.
+simulations. It needs libsumo and nothing of saferl: messages are of plain numbers, as to unpickle a class imports its
+module. Positions are SUMO's: of the middle of the front bumper, m, y up.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class Simulation:
 
         self.sumo: Any = libsumo
 
-    def begin(self, options: list[str], cars: list[tuple], route: int, pose: Pose) -> Seen:
+    def begin(self, options: list[str], cars: list[tuple], route: int, pose: Pose) -> None:
         """Another episode: the ego and these cars at their places, at time 0."""
         if self.sumo.isLoaded():
             self.sumo.load(options)
@@ -53,7 +54,8 @@ class Simulation:
         self.sumo.vehicle.setSpeedMode(EGO, 0)
         self.sumo.vehicle.setLaneChangeMode(EGO, 0)
         self.enter(cars)
-        return self._step(pose)
+        if len(self._step(pose)) < len(cars):
+            raise RuntimeError("not every car could enter")
 
     def enter(self, cars: list[tuple]) -> None:
         """Let these cars, each the fields of a :class:`Car`, onto the road at the end of the next step."""
@@ -92,7 +94,7 @@ def serve(connection: Connection) -> None:
     while True:
         try:
             name, arguments = connection.recv()
-        except EOFError:
+        except (EOFError, OSError):
             return
         try:
             done = True, getattr(simulation, name)(*arguments)
@@ -111,8 +113,10 @@ def main(descriptors: list[int]) -> None:
             for other in descriptors:
                 if other != mine:
                     os.close(other)
-            serve(Connection(mine))
-            os._exit(0)
+            try:
+                serve(Connection(mine))
+            finally:
+                os._exit(0)
     for descriptor in descriptors:
         os.close(descriptor)
     for _ in descriptors:
