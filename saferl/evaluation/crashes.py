@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from saferl.envs.intersection import BatchedIntersection, Scenario
-from saferl.envs.intersection.drivers import CautiousDriver, Driver
+from saferl.envs.intersection.batched import State
+from saferl.envs.intersection.drivers import Brake, CautiousDriver
 from saferl.envs.intersection.dynamics import ACTION_SCALE
 from saferl.envs.intersection.episode import WORDS
-from saferl.evaluation.play import play
+from saferl.envs.intersection.foresight import Simulator, safe_for
 from saferl.evaluation.trace import Trace
 
 #: Seconds before a crash from which another driver takes over.
 MOMENTS = tuple(0.5 * k for k in range(1, 11))
-#: How long before a crash a warning is looked for, and how long after it nobody may have crashed, s.
+#: How long before a crash a warning is looked for, and how long after its time nobody may have crashed, s.
 BEFORE, AFTER = 5.0, 5.0
-_AT_ONCE = 630  # episodes
 #: Of :func:`explain`.
 COLUMNS: tuple[str, ...] = (
     "episode", "seed", "task", "what", "car", "time", "speed", "car_speed", "priority", "warning", "corrected", "braking",
@@ -42,49 +39,6 @@ def way(route: int) -> str:
     return f"{_FROM[route // 4]}, {_WAY[route % 4]}"
 
 
-class _TakesOver(TensorDictModuleBase):
-    """Plays recorded actions [B, T, 2] up to the decisions ``until`` [B], then drives by itself: braking along the lane, or as
-    the cautious driver where ``cautious`` [B]."""
-
-    def __init__(self, actions: Tensor, until: Tensor, cautious: Tensor):
-        super().__init__()
-        self.in_keys, self.out_keys = ["ego", "vehicles", "route"], ["action"]
-        self.actions, self.until, self.cautious = actions, until, cautious
-        self.brake, self.careful, self.time = Driver(speed=0.0), CautiousDriver(), 0
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = self.actions[:, min(self.time, self.actions.shape[1] - 1)].clone()
-        over = self.time >= self.until
-        for driver, rows in (
-            (self.brake, over & ~self.cautious),
-            (self.careful, over & self.cautious),
-        ):
-            if rows.any():
-                action[rows] = driver(tensordict.select(*self.in_keys)[rows])["action"]
-        self.time += 1
-        return tensordict.set("action", action)
-
-
-def _crash(
-    scenario: Scenario, seeds: Tensor, actions: Tensor, until: Tensor, cautious: Tensor
-) -> Tensor:
-    """The decision in which a crash comes in each episode [B] where another driver takes over at ``until``, counted from 1,
-    and 0 where none comes as far as is looked."""
-    longest = actions.shape[1] / scenario.policy_frequency + AFTER
-    scenario = dataclasses.replace(scenario, duration=min(scenario.duration, longest))
-    ends = []
-    for rows in torch.arange(len(seeds)).split(_AT_ONCE):
-        env = BatchedIntersection(scenario, num_envs=len(rows))
-        policy = _TakesOver(actions[rows], until[rows], cautious[rows])
-        steps = play(policy, env, seeds[rows])
-        crashed = torch.stack(
-            [step["next", "collision"] | step["next", "offroad"] for step in steps]
-        )
-        alive = torch.stack([step["alive"] for step in steps])
-        ends.append(torch.where((crashed.squeeze(-1) & alive).any(0), alive.sum(0), 0))
-    return torch.cat(ends)
-
-
 def explain(trace: Trace, scenario: Scenario) -> list[dict[str, Any]]:
     """A row for each crash of a trace.
 
@@ -98,8 +52,8 @@ def explain(trace: Trace, scenario: Scenario) -> list[dict[str, Any]]:
         ``warning``: how many seconds before the crash, at most 5, the risk of what the policy proposed was first above
         the limit; ``corrected``: the share of the decisions from then on that the projector changed; ``braking`` and
         ``cautious``: how many seconds before the crash, at most 5, the last moment lay from which braking along the lane, or the
-        cautious driver, would have come without a crash to 5 s after the last of these crashes, in the batched simulator. None where there is none. A replay that does not end
-        in the same decision by itself, as of an episode with SUMO's drivers, has neither.
+        cautious driver who sees all cars, would have come without a crash for 10 s, in the batched simulator. None where there is
+        none. A replay that does not end in the same decision by itself, as of an episode with SUMO's drivers, has neither.
     """
     dt, limit = trace.about["dt"], trace.about.get("risk_limit")
     kinds = trace.episodes["outcome"]
@@ -146,36 +100,45 @@ def _saved(
     """``braking`` and ``cautious`` of each crash."""
     if not crashes:
         return []
-    longest = max(map(len, actions))
-    played = torch.zeros(len(crashes), longest, 2)
-    for index, each in enumerate(actions):
-        played[index, : len(each)] = torch.from_numpy(each)
     length = torch.tensor([len(each) for each in actions])
-    # First nobody takes over, then each driver at each moment.
-    back = torch.tensor([0.0, *MOMENTS, *MOMENTS])
-    until = length[:, None] - (back / dt).round().long()
-    until[:, 0] = longest + 1
-    cautious = torch.arange(len(back)) > len(MOMENTS)
-    variants = len(back)
-    seeds = torch.tensor([row["seed"] for row in crashes])
-    crash = _crash(
-        scenario,
-        seeds.repeat_interleave(variants),
-        played.repeat_interleave(variants, 0),
-        until.flatten(),
-        cautious.repeat(len(crashes)),
-    ).reshape(len(crashes), variants)
-    possible = (until >= 0) & (crash[:, :1] == length[:, None])
-    results = []
-    for alive in ((crash == 0) & possible).tolist():
-        by = {"braking": alive[1 : len(MOMENTS) + 1], "cautious": alive[len(MOMENTS) + 1 :]}
-        results.append(
-            {
-                name: next((t for t, good in zip(MOMENTS, saved, strict=True) if good), None)
-                for name, saved in by.items()
-            }
-        )
-    return results
+    until = length[:, None] - (torch.tensor(MOMENTS) / dt).round().long()
+    scenes, crashed = _scenes(scenario, [row["seed"] for row in crashes], actions, until)
+    prediction, horizon = Simulator(patience=AFTER), BEFORE + AFTER
+    lasts = torch.stack(
+        [safe_for(prediction, scenario, scenes, d, horizon) for d in (Brake(), CautiousDriver())]
+    )
+    helps = lasts.isinf().reshape(2, *until.shape) & (until >= 0) & (crashed == length)[:, None]
+    return [
+        {
+            name: next((t for t, good in zip(MOMENTS, saved, strict=True) if good), None)
+            for name, saved in zip(("braking", "cautious"), each, strict=True)
+        }
+        for each in helps.movedim(1, 0).tolist()
+    ]
+
+
+def _scenes(
+    scenario: Scenario, seeds: Sequence[int], actions: Sequence[np.ndarray], until: Tensor
+) -> tuple[State, Tensor]:
+    """Play recorded actions again: the scenes before the decisions ``until`` [C, M], [C * M] crash by crash, and the
+    decision in which each of C episodes now crashes [C], counted from 1; 0 where none does."""
+    length = torch.tensor([len(each) for each in actions])
+    env = BatchedIntersection(scenario, num_envs=len(seeds))
+    tensordict = env.reset(seeds=torch.tensor(seeds))
+    scenes = {
+        key: value[:, None].repeat(1, until.shape[1], *[1] * (value.ndim - 1))
+        for key, value in env.state.items()
+    }
+    crashed = torch.zeros_like(length)
+    for number in range(int(length.max())):
+        crash, moment = (until == number).nonzero(as_tuple=True)
+        for key, value in env.state.items():
+            scenes[key][crash, moment] = value[crash]
+        action = np.stack([each[min(number, len(each) - 1)] for each in actions])
+        after = env.step(tensordict.set("action", torch.from_numpy(action)))["next"]
+        ends = (after["collision"] | after["offroad"]).squeeze(-1)
+        crashed = torch.where((crashed == 0) & ends, number + 1, crashed)
+    return {key: value.flatten(0, 1) for key, value in scenes.items()}, crashed
 
 
 def table(crashes: Sequence[Mapping[str, Any]], episodes: int) -> str:

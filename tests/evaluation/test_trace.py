@@ -10,7 +10,7 @@ import torch
 from torchrl.envs import TransformedEnv
 
 from saferl.envs.intersection import BatchedIntersection, HighwayIntersection, Scenario
-from saferl.envs.intersection.drivers import CautiousDriver, Driver
+from saferl.envs.intersection.drivers import Brake, CautiousDriver, Driver
 from saferl.envs.intersection.dynamics import to_physical
 from saferl.envs.intersection.geometry import overlap
 from saferl.envs.intersection.true_scene import TrueScene
@@ -211,7 +211,7 @@ def test_the_moment_that_helps_is_found_by_playing_it(blind):
                 action = torch.from_numpy(actions[number]) / torch.tensor([5.0, 0.6])
                 tensordict["action"] = action[None]
             else:
-                tensordict = Driver(speed=0.0)(tensordict)
+                tensordict = Brake()(tensordict)
             after = env.step(tensordict)
             if after["next", "collision"].item() or after["next", "offroad"].item():
                 return True

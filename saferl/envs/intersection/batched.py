@@ -60,6 +60,11 @@ def _lanes(state: State, whose: str) -> Lanes:
     return Lanes(*(state[whose + name].movedim(-1, 0) for name in Lanes._fields))
 
 
+def states_of(state: State) -> Tensor:
+    """States of the surrounding vehicles [B, N, 6] in a state of the batched intersection."""
+    return vehicle_states(vehicles_of(state), _lanes(state, _LANE))
+
+
 def _roads(vehicles: Vehicles, ego_route: Tensor) -> State:
     """What follows from the routes [N, B] and [B] alone, looked up once an episode."""
     route, like = vehicles.route, vehicles.s
@@ -117,8 +122,7 @@ def look(scenario: Scenario, state: State) -> tuple[State, Tensor]:
         ``seen_ego`` [B, F] and ``seen_vehicles`` [B, M, G], the observation as it is sensed, and
         ``within_view`` [B, N], which vehicles are truly observable; and the true ``ego`` [B, F].
     """
-    vehicles = vehicles_of(state)
-    others = vehicle_states(vehicles, _lanes(state, _LANE))
+    vehicles, others = vehicles_of(state), states_of(state)
     ego, route, how = state["ego"], state["route"], (scenario.rows, scenario.observation)
     present = state[_VEHICLE + "present"]
     own, table, within_view = observe(ego, others, present, route, *how)
@@ -131,17 +135,13 @@ def look(scenario: Scenario, state: State) -> tuple[State, Tensor]:
     return view, own
 
 
-def advance(scenario: Scenario, state: State, action: Tensor) -> tuple[State, State]:
-    """One decision of every environment: a pure function, without a loop over them or vehicles.
+#: Who moves the surrounding vehicles [N, B]: they and the egos [B, 6] before a substep, and its number, to the vehicles
+#: after it.
+Movers = Callable[[Vehicles, Tensor, int], Vehicles]
 
-    Args:
-        scenario: settings.
-        state: as :func:`begin` gives, each [B, ...].
-        action: [B, 2] in [-1, 1].
 
-    Returns:
-        The next state; and outcomes, ``reward``, ``cost`` and ends, each [B].
-    """
+def _by_rules(scenario: Scenario, state: State) -> tuple[Vehicles, Movers]:
+    """The vehicles as they heed the rules of the road from this decision on, and how they then move."""
     ego, steps, vehicles = state["ego"], state["steps"], vehicles_of(state)
     lane, own_lane = _lanes(state, _LANE), _lanes(state, _OWN)
     pair = state["pair"].movedim(0, -1)
@@ -155,42 +155,38 @@ def advance(scenario: Scenario, state: State, action: Tensor) -> tuple[State, St
     def moved(vehicles: Vehicles, ego: Tensor, substep: int) -> Vehicles:
         return move(vehicles, lane, accelerate(vehicles, lane, pair, ego), scenario.dt)
 
-    return drive(scenario, state, action, vehicles, moved)
+    return vehicles, moved
 
 
 def drive(
-    scenario: Scenario,
-    state: State,
-    action: Tensor,
-    vehicles: Vehicles,
-    moved: Callable[[Vehicles, Tensor, int], Vehicles],
-) -> tuple[State, State]:
-    """A decision of every ego, and what comes of it, among vehicles that somebody else moves.
+    scenario: Scenario, state: State, control: Tensor, movers: Movers | None = None
+) -> tuple[State, Tensor]:
+    """All cars one decision on: the physics of :func:`advance`, which ends at a collision.
 
     Args:
-        scenario, state, action: as of :func:`advance`.
-        vehicles: where they begin, each [N, B].
-        moved: of vehicles and egos [B, 6] before a substep and its number: the vehicles after it.
+        scenario: settings.
+        state: as :func:`begin` gives, each [B, ...]; what is seen may be missing, and stays as it is.
+        control: [B, 2], physical units.
+        movers: of the other cars; None: they heed the rules of the road.
 
     Returns:
-        As :func:`advance`.
+        The next state; and how near the ego came to another body, m [B] (:func:`separation`; <= 0: a collision, inf:
+        nobody is there).
     """
-    # Laid out like the rest: the action that comes in is not.
-    control = columns(*to_physical(action).unbind(-1))
     ego, route, steps, lane = state["ego"], state["route"], state["steps"], _lanes(state, _LANE)
-    previous = torch.where(steps[:, None] == 0, control, state["control"])
-    others = vehicle_states(vehicles_of(state), lane)
-    cost = scenario.cost(ego, control, others, state["within_view"])
+    vehicles, moved = (vehicles_of(state), movers) if movers else _by_rules(scenario, state)
     traffic = scenario.traffic.vehicles[1] > 0
-    collision = torch.zeros_like(steps, dtype=torch.bool)
-    for substep in range(SUBSTEPS):  # a collision ends a decision at once
+    gap = torch.full_like(ego[:, 0], torch.inf)
+    for substep in range(SUBSTEPS):
+        collision = gap <= 0
         if traffic:
             vehicles = _choose(collision, vehicles, moved(vehicles, ego, substep))
         ego = torch.where(collision[:, None], ego, step_ego(ego, control, scenario.dt))
         if traffic:
             place, _ = lane_frames(lane, vehicles.s)
-            gap = separation(frame(ego[:, 0], ego[:, 1], ego[:, 4]), place)
-            collision = collision | (torch.where(vehicles.present, gap, torch.inf).amin(0) <= 0)
+            apart = separation(frame(ego[:, 0], ego[:, 1], ego[:, 4]), place)
+            apart = torch.where(vehicles.present, apart, torch.inf).amin(0)
+            gap = torch.minimum(gap, apart)
     after = state | {
         "ego": ego,
         "control": control,
@@ -200,7 +196,29 @@ def drive(
     if scenario.traffic.respawn:
         vehicles = respawn(scenario.traffic, vehicles, route, state["seed"], steps)
         after |= _roads(vehicles, route)
-    after |= _named(_VEHICLE, vehicles)
+    return after | _named(_VEHICLE, vehicles), gap
+
+
+def advance(
+    scenario: Scenario, state: State, action: Tensor, movers: Movers | None = None
+) -> tuple[State, State]:
+    """One decision of every environment: a pure function, without a loop over them or vehicles.
+
+    Args:
+        scenario: settings.
+        state: as :func:`begin` gives, each [B, ...].
+        action: [B, 2] in [-1, 1].
+        movers: see :func:`drive`.
+
+    Returns:
+        The next state; and outcomes, ``reward``, ``cost`` and ends, each [B].
+    """
+    # Laid out like the rest: the action that comes in is not.
+    control = columns(*to_physical(action).unbind(-1))
+    previous = torch.where(state["steps"][:, None] == 0, control, state["control"])
+    cost = scenario.cost(state["ego"], control, states_of(state), state["within_view"])
+    after, gap = drive(scenario, state, control, movers)
+    ego, route, collision = after["ego"], after["route"], gap <= 0
     seen, own = look(scenario, after)
     after |= seen
     off = offroad(ego)
@@ -226,6 +244,11 @@ class TensorIntersection(IntersectionBase):
     def _observation(self) -> State:
         seen = {"ego": "seen_ego", "vehicles": "seen_vehicles", "route": "route"}
         return {key: self._state[name] for key, name in seen.items()}
+
+    @property
+    def state(self) -> State:
+        """What :func:`advance` takes: the scenes of now, each [B, ...]."""
+        return self._state
 
     def scene(self) -> tuple[Tensor, Vehicles]:
         """The true states of the egos [B, 6], and the surrounding vehicles [N, B], seen or not."""

@@ -78,6 +78,26 @@ class Driver(TensorDictModuleBase):
         return tensordict.set("action", action.clamp(-1.0, 1.0))
 
 
+class Brake(Driver):
+    """Brakes along the lane of its route as hard as it can.
+
+    >>> from saferl.envs.intersection import BatchedIntersection, Scenario
+    >>> env = BatchedIntersection(Scenario(task="lt", vehicles=0), num_envs=4)
+    >>> bool((env.rollout(11, Brake())["next", "ego"][:, -1, 0] < 0.1).all())  # from 10 m/s and below
+    True
+    """
+
+    def target_speed(self, ego: Tensor, vehicles: Tensor, line: Tensor, s: Tensor) -> Tensor:
+        return torch.full_like(s, -self.speed)
+
+
+class Hold(Driver):
+    """Follows the lane of its route at the speed that it has."""
+
+    def target_speed(self, ego: Tensor, vehicles: Tensor, line: Tensor, s: Tensor) -> Tensor:
+        return ego[..., 3]
+
+
 class CautiousDriver(Driver):
     """Follows its lane as fast as is predicted to hit nobody, and creeps or waits meanwhile.
 

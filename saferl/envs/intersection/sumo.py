@@ -25,8 +25,8 @@ from saferl.envs.intersection.base import OUTCOMES, SUBSTEPS, ReplayedIntersecti
 from saferl.envs.intersection.batched import (
     State,
     TensorIntersection,
+    advance,
     begin,
-    drive,
     vehicles_of,
 )
 from saferl.envs.intersection.dynamics import step_ego, to_physical
@@ -201,7 +201,7 @@ class SumoIntersection(ReplayedIntersection, TensorIntersection):
             return placed(vehicles, list(seen[substep]))
 
         before = vehicles_of(state)
-        state, shown = drive(self.task, state, action, before, moved)
+        state, shown = advance(self.task, state, action, moved)
         if self.task.traffic.respawn:
             self._let_in(actions, vehicles_of(state), placed(before, list(seen[-1])).present)
         return self._keep(rows, state, shown)
