@@ -98,7 +98,7 @@ def main() -> None:
             sides[f"{name} {batch}"] = correct
         with torch.no_grad():
             projected = forms["compiled"].transform.inv(data.copy())
-        taken = projected["_safety_projection", "projection_steps"]
+        taken = projected["_correction", "projection_steps"]
         if not bool((taken == options.steps).all()):
             raise SystemExit(f"Expected {options.steps} steps of each state, got {taken}.")
         difference = (projected["action"] - plain(printed, data, options.steps)).abs().amax(-1)

@@ -58,6 +58,7 @@ def run(tmp_path_factory) -> Path:
         ["reward_audit", "--episodes", "4"],
         ["soak", "--decisions", "640", "--updates", "20", "--num-envs", "16", "--set", "env.compile_physics=false",
          "evaluation.episodes=1"],
+        ["shield", "--batches", "2", "--decisions", "2", *SHORT],
         ["mmam_forms", "--seeds", "0", "--updates", "20", "--width", "16"],
     ],
     ids=lambda arguments: arguments[0],

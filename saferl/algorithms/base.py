@@ -9,14 +9,15 @@ from typing import Any, ClassVar
 
 import hydra
 import torch
+from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, Transform
 from torchrl.objectives import LossModule
 
 from saferl.algorithms.networks import NetworkBuilder, critic_options, refuse_options
-from saferl.algorithms.parts import Parts, make
+from saferl.algorithms.parts import Parts, make, takes
 from saferl.envs.task import Task
-from saferl.envs.transforms import SafetyProjector
+from saferl.envs.transforms import Correction
 from saferl.modules import CriticEnsemble, CVaR, MeanStd
 from saferl.training.learner import Learner
 from saferl.training.trainer import Experience
@@ -37,13 +38,13 @@ class Agent:
         actor: the policy.
         observed: keys of the observation that the networks read.
         loss: owns the live parameters of all networks, targets, temperature and multiplier.
-        projector: a :class:`SafetyProjector` on the loss's live cost critics, or None.
+        projector: what corrects its actions, such as a :class:`SafetyProjector` on the loss's live cost critics, or None.
     """
 
     actor: TensorDictModuleBase
     observed: tuple[str, ...]
     loss: LossModule
-    projector: SafetyProjector | None
+    projector: Correction | None
 
     @property
     def transforms(self) -> list[Transform]:
@@ -58,14 +59,22 @@ class Agent:
     @property
     def limit(self) -> float | None:
         """What the risk is to stay below in each state: the projector's, else the loss's; None where nothing limits it there."""
-        if self.projector is not None:
-            return self.projector.limit
+        limit = getattr(self.projector, "limit", None)
+        if limit is not None:
+            return limit
         return float(getattr(self.loss, "risk_limit", 0.0)) or None
 
     @property
     def stored(self) -> tuple[Any, ...]:
         """Keys of a transition that are kept: what the networks read of a state and of the next, and :data:`STORED`."""
         return (*self.observed, *(("next", key) for key in self.observed), *STORED)
+
+
+def chain(projector: DictConfig) -> list[DictConfig]:
+    """The node of a projector, before it those of what corrects first; none where actions are executed as proposed."""
+    if projector.get("_target_") is None:
+        return []
+    return [*(chain(projector.first) if "first" in projector else []), projector]
 
 
 class Algorithm(ABC):
@@ -146,8 +155,8 @@ class Algorithm(ABC):
         Raises:
             ValueError: names them, and what to set.
         """
-        takes, loss = parts.takes, parts.loss._target_
-        if self.values not in takes:
+        accepted, loss = parts.takes, parts.loss._target_
+        if self.values not in accepted:
             raise ValueError(
                 f"{type(self).__name__} learns by losses with a {self.values}, which {loss} has not: "
                 "leave learning= to the algorithm."
@@ -158,15 +167,17 @@ class Algorithm(ABC):
             "risk": parts.risk._target_ is not None,
         }
         for name, present in groups.items():
-            if present and name not in takes:
+            if present and name not in accepted:
                 raise ValueError(f"{loss} takes no {name}: set {name}=none, or another loss.")
-            if name in takes and not present:
+            if name in accepted and not present:
                 raise ValueError(f"{loss} needs {name}, got {name}=none.")
         if not groups["cost_critic"]:
             refuse_options(
                 "cost_critic", parts.cost_critic, "is of cost critics, but cost_critic=none"
             )
-        if parts.projector._target_ is not None and self.risks not in takes:
+        if self.risks not in accepted and any(
+            takes(node, "risk") for node in chain(parts.projector)
+        ):
             raise ValueError(
                 f"projector needs cost critics Q_c(s, a), which {loss} has not: "
                 "set projector=none, or loss=sac_lag or ppo_risk."
@@ -190,7 +201,7 @@ class Algorithm(ABC):
             ValueError: parts that do not go together.
         """
         self.check(parts)
-        networks, takes = NetworkBuilder(parts), parts.takes
+        networks, accepted = NetworkBuilder(parts), parts.takes
         actor = networks.actor(self.initial_std)
         settings = {
             "actor_network": lambda: actor,
@@ -199,12 +210,16 @@ class Algorithm(ABC):
             "num_cost_critics": lambda: parts.cost_critic.members,
             "lagrange": lambda: make(parts.lagrange.multiplier),
         }
-        built = {name: part() for name, part in settings.items() if name in takes}
+        built = {name: part() for name, part in settings.items() if name in accepted}
         loss = make(parts.loss, **built).to(parts.device)
         self.estimate(loss, parts.gamma)
         projector = None
-        if parts.projector._target_ is not None:
-            projector = make(parts.projector, risk=loss.cost_value)
+        for node in chain(parts.projector):
+            alone = node.copy()
+            OmegaConf.set_struct(alone, False)
+            alone.pop("first", None)
+            given = {"risk": loss.cost_value} if takes(node, "risk") else {}
+            projector = make(alone, **given, **({"first": projector} if projector else {}))
         return Agent(actor, tuple(networks.observed), loss, projector)
 
     def optimizer(self, loss: LossModule) -> torch.optim.Optimizer:

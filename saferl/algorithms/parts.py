@@ -68,6 +68,12 @@ def offered(node: DictConfig, task: Task) -> dict[str, Any]:
     }
 
 
+def takes(node: DictConfig, key: str) -> bool:
+    """Whether what a node makes takes an argument of this name."""
+    accepted = arguments(node._target_)
+    return accepted is None or key in accepted
+
+
 @dataclass(frozen=True)
 class Parts:
     """What an algorithm is composed of: the nodes of a configuration, and the task.

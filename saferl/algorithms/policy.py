@@ -11,16 +11,11 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from saferl.algorithms.assemble import load_agent
-from saferl.algorithms.base import Agent
+from saferl.algorithms.base import Agent, chain
 from saferl.checkpoint.run import progress, run_config
 from saferl.config.locate import pretrained_run, shipped
-from saferl.envs.transforms import SafetyProjector
+from saferl.envs.transforms import Correction
 from saferl.training.progress import Budget
-
-#: What a policy with a projector writes besides the action.
-REPORTED = (
-    "action_proposed", "risk_before", "risk_after", "projection_steps", "intervened", "feasible",
-)  # fmt: skip
 
 
 class SafePolicy(TensorDictModuleBase):
@@ -33,7 +28,7 @@ class SafePolicy(TensorDictModuleBase):
         projector: of its actions; None: they are executed as they are.
         low, high: of the actions.
 
-    Reads what ``actor`` and the projector's risk read. Writes ``action`` [*B, A], what is to be executed; with a projector
+    Reads what ``actor`` and the projector read. Writes ``action`` [*B, A], what is to be executed; with a projector
     also ``action_proposed`` [*B, A], ``risk_before``, ``risk_after`` [*B, 1], ``intervened`` [*B, 1] (bool) and what else
     :class:`~saferl.envs.transforms.SafetyProjector` tells.
 
@@ -54,15 +49,17 @@ class SafePolicy(TensorDictModuleBase):
     def __init__(
         self,
         actor: TensorDictModuleBase,
-        projector: SafetyProjector | None = None,
+        projector: Correction | None = None,
         low: float = -1.0,
         high: float = 1.0,
     ):
         super().__init__()
-        risk = () if projector is None else projector.risk.in_keys
-        keys = dict.fromkeys((*actor.in_keys, *risk))
+        reads, reports = (), ()
+        if projector is not None:
+            reads, reports = projector.reads, ("action_proposed", *projector.reports)
+        keys = dict.fromkeys((*actor.in_keys, *reads))
         self.in_keys: list = [key for key in keys if key != "action"]
-        self.out_keys: list = ["action", *(REPORTED if projector is not None else ())]
+        self.out_keys: list = ["action", *reports]
         self.actor, self.projector, self.box = actor, projector, {"low": low, "high": high}
 
     @torch.no_grad()
@@ -85,9 +82,10 @@ class SafePolicy(TensorDictModuleBase):
 def compiling(cfg: DictConfig, on: bool) -> DictConfig:
     """A run's configuration with the physics and the projection compiled or not, as far as it has them."""
     cfg = cfg.copy()
-    for part, key in (("env", "compile_physics"), ("projector", "compile")):
-        if key in cfg[part]:
-            cfg[part][key] = on
+    parts = [(cfg.env, "compile_physics"), *((node, "compile") for node in chain(cfg.projector))]
+    for part, key in parts:
+        if key in part:
+            part[key] = on
     return cfg
 
 

@@ -8,7 +8,7 @@ import logging
 import statistics
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,8 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.transforms import Transform
 
 from saferl.algorithms.assemble import build_env
-from saferl.algorithms.parts import device_of, make, offered
+from saferl.algorithms.base import chain
+from saferl.algorithms.parts import device_of, make, offered, takes
 from saferl.algorithms.policy import compiling, trained_agent
 from saferl.checkpoint.run import run_config
 from saferl.cli.again import asked, is_there, keep
@@ -80,7 +81,24 @@ class Candidate:
         origin = {"algo": cfg.algo_name, "training_seed": cfg.seed}
         if not project and agent.projector is not None:
             origin["algo"] += " unprojected"
-        return cls(name, agent.actor, transforms, agent.risk, agent.limit, about, origin)
+        who = cls(name, agent.actor, transforms, agent.risk, agent.limit, about, origin)
+        return who.called(cfg.projector.get("name")) if project else who
+
+    def behind(self, node: DictConfig) -> Candidate:
+        """The same with a projector behind its own, which has the last word; itself where the node is of none."""
+        if node.get("_target_") is None:
+            return self
+        own: dict[str, Any] = {"first": self.transforms[0]} if self.transforms else {}
+        who = replace(self, transforms=[make(node, **own)])
+        return who.called(node.get("name"))
+
+    def called(self, name: str | None) -> Candidate:
+        """The same in a row of its own, ``arsac + shield``, where what corrects it has a name."""
+        if name is None:
+            return self
+        own, of, run = self.name.partition(" (")
+        origin = {**self.origin, "algo": f"{self.origin['algo']} + {name}"}
+        return replace(self, name=f"{own} + {name}{of}{run}", origin=origin)
 
 
 def pictures(
@@ -125,6 +143,12 @@ def drawn(rows: list[dict], cfg: DictConfig) -> list[dict]:
 
 def evaluate(cfg: DictConfig) -> None:
     """Test a policy that the configuration names, and draw, trace and explain those episodes that it asks for."""
+    for node in chain(cfg.projector):
+        if takes(node, "risk"):
+            raise ValueError(
+                f"projector: {node._target_} corrects by a policy's own critics, with which it drives already if it was "
+                "trained so (project=true); a test takes one that needs none, such as projector=shield."
+            )
     check_targets(cfg)
     torch.set_num_threads(cfg.threads)
     OmegaConf.resolve(cfg)
@@ -135,7 +159,8 @@ def evaluate(cfg: DictConfig) -> None:
         )
     if (cfg.trace != "none" or cfg.why) and not isinstance(task, Scenario):
         raise ValueError(f"trace must be none and why false, as task={task.task} is not the road.")
-    title = f"{who.name.partition(' ')[0]}-{task.task}-seed{cfg.seed}"
+    called = who.name.partition(" (")[0].replace(" ", "")
+    title = f"{called}-{task.task}-seed{cfg.seed}"
     folder = f"evaluation/{title}/{datetime.now():%Y-%m-%d_%H-%M-%S-%f}"
     out = job_folder() or Path(folder if cfg.out is None else str(cfg.out))
     test = asked(cfg) if job_folder() else None
@@ -256,7 +281,8 @@ def choose_policy(
         cfg = on_its_own_task(cfg, cfg, overrides)
         task = make(cfg.task)
         driver = task.driver(name, cfg.seed)
-        return cfg, task, Candidate(name, driver, origin={"algo": name})
+        who = Candidate(name, driver, origin={"algo": name})
+        return cfg, task, who.behind(cfg.projector)
     path = pretrained_run(name) if source == "pretrained" else Path(name)
     trained = run_config(path, source)
     check_targets(trained)
@@ -272,7 +298,7 @@ def choose_policy(
             )
     called = f"{trained.algo_name} ({name})"
     who = Candidate.trained(called, compiling(trained, cfg.compile), path, cfg.project)
-    return cfg, task, who
+    return cfg, task, who.behind(cfg.projector)
 
 
 def measure(

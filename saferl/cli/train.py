@@ -106,7 +106,7 @@ def closing_test(cfg: DictConfig, run: Path) -> None:
             for name, rows in results.items()
         ]
         log.info("\n%s\n%s", title, side_by_side(runs, tuple(FIGURES)))
-    chosen = drawn(results[cfg.algo_name], settings)
+    chosen = drawn(results[mine.name], settings)
     pictures(cfg.env, task, mine, chosen, out, cfg.device, settings.draw_format)
 
 

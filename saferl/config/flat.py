@@ -22,3 +22,13 @@ def flat(node: Any, prefix: str = "") -> dict[str, Any]:
         for key, below in node.items()
         for name, value in flat(below, f"{prefix}.{key}".removeprefix(".")).items()
     }
+
+
+def system_name(settings: Mapping[str, Any]) -> str:
+    """What a system is system_name: its algorithm, and what corrects it if that has a name. Settings by dotted keys.
+
+    >>> system_name({"algo_name": "sac", "projector.name": "shield"}), system_name({"algo_name": "sac"})
+    ('sac + shield', 'sac')
+    """
+    names = [settings.get(key) for key in ("algo_name", "projector.name")]
+    return " + ".join(str(name) for name in names if name)

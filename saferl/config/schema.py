@@ -265,6 +265,7 @@ class Test:
 
     task: dict[str, Any] = field(default_factory=dict)
     env: dict[str, Any] = field(default_factory=dict)
+    projector: dict[str, Any] = field(default_factory=dict)
     checkpoint: str | None = MISSING
     pretrained: str | None = MISSING
     policy: str | None = MISSING

@@ -13,7 +13,7 @@ from typing import Any
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from saferl.config.flat import flat
+from saferl.config.flat import flat, system_name
 
 #: Not the composition: what tells its repetitions apart.
 REPETITION = ("seed", "out")
@@ -91,7 +91,7 @@ def names(configs: Sequence[Mapping]) -> list[str]:
     ['sac gs tau=0.1', 'sac gs tau=0.1', 'sac gs tau=0.2', 'asac gs']
     """
     settings = [flat(config) for config in configs]
-    titles = [f"{each['algo_name']} {each['task.task']}" for each in settings]
+    titles = [f"{system_name(each)} {each['task.task']}" for each in settings]
     called = []
     for title, mine in zip(titles, settings, strict=True):
         others = [s for t, s in zip(titles, settings, strict=True) if t == title]

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 
 from saferl.checkpoint.lock import worker
 from saferl.checkpoint.run import CONFIG, run_config
-from saferl.config.flat import MADE, flat
+from saferl.config.flat import MADE, flat, system_name
 from saferl.envs.intersection.geometry import ROUTES, TASK_OF_ROUTE
 from saferl.evaluation.compare import REPETITION, TESTED
 from saferl.evaluation.rows import read
@@ -60,8 +60,8 @@ class Run:
 
     @property
     def algo(self) -> str:
-        """Name of its algorithm, "" if its configuration cannot be read."""
-        return str(self.settings.get("algo_name", ""))
+        """Name of its algorithm, with that of a projector that has one (a shield); "" if its configuration cannot be read."""
+        return system_name(self.settings)
 
     @property
     def seed(self) -> int:

@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 
 from tensordict import TensorDictBase
 
-from saferl.envs.transforms import SafetyProjector
+from saferl.envs.transforms import Correction
 from saferl.modules import LagrangeMultiplier
 from saferl.training.limit import EARLY
 from saferl.training.trainer import Trainer
@@ -109,7 +109,7 @@ class ProjectorProgress:
         projector: the environment's transform.
     """
 
-    def __init__(self, projector: SafetyProjector):
+    def __init__(self, projector: Correction):
         self.projector = projector
 
     def register(self, trainer: Trainer) -> None:

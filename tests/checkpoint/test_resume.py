@@ -106,6 +106,7 @@ def test_killed_and_resumed_equals_uninterrupted(algo: str, tmp_path: Path, spaw
         ("rsac", 5, "dense"),
         ("ppo_lag", 0, "dense"),
         ("cpo", 0, "nominal"),
+        ("sac", 3, "dense"),  # behind a shield, which has nothing to remember
     ],
 )
 def test_every_later_step_is_the_same(algo: str, vehicles: int, scenario: str, tmp_path: Path):
@@ -119,6 +120,7 @@ def test_every_later_step_is_the_same(algo: str, vehicles: int, scenario: str, t
     options += ["save_every=1000", "task.duration=3"]
     options += [f"task.vehicles={vehicles}", f"task.scenario={scenario}"]
     options += ["projector.start=0.4", "lagrange=pid"] if algo == "rsac" else []
+    options += ["projector=shield", "projector.horizon=1"] if algo == "sac" else []
     trainer = build_trainer(compose(*options), tmp_path / "a")
     trainer.save()
     batches = iter(trainer.collector)

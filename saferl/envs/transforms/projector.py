@@ -3,33 +3,24 @@
 from __future__ import annotations
 
 import time
-from collections import deque
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
+from saferl.envs.transforms.correction import Correction
 from saferl.modules.compiled import Compiled
 from saferl.modules.projection import project
 
-_STASH = "_safety_projection"
 _ROWS = 32  # corrected together in compiled code
-_REPORT = {
-    "risk_before": torch.float32,
-    "risk_after": torch.float32,
-    "projection_steps": torch.float32,
-    "intervened": torch.bool,
-    "feasible": torch.bool,
-}
 
 
-class SafetyProjector(Transform):
+class SafetyProjector(Correction):
     """Executes a corrected action wherever the risk of the proposed one exceeds a limit.
 
     The correction is :func:`saferl.modules.project` (paper, E8 to E10) on the risk
@@ -86,6 +77,14 @@ class SafetyProjector(Transform):
         True
     """
 
+    reports: ClassVar[Mapping[str, torch.dtype]] = {
+        "risk_before": torch.float32,
+        "risk_after": torch.float32,
+        "projection_steps": torch.float32,
+        **Correction.reports,
+        "feasible": torch.bool,
+    }
+
     def __init__(
         self,
         risk: TensorDictModuleBase,
@@ -99,13 +98,12 @@ class SafetyProjector(Transform):
         compile: bool = False,
         action_key: NestedKey = "action",
     ):
-        super().__init__()
+        super().__init__(action_key)
         if not 0.0 <= start <= 1.0:
             raise ValueError(f"start must be a fraction in [0, 1], got {start}.")
-        action_key = unravel_key(action_key)
-        if action_key not in getattr(risk, "in_keys", ()):
+        if self.action_key not in getattr(risk, "in_keys", ()):
             raise ValueError(
-                f"risk must be a TensorDictModule that reads {action_key!r}, got {risk}."
+                f"risk must be a TensorDictModule that reads {self.action_key!r}, got {risk}."
             )
         self.risk = risk
         self.limit = float(limit)
@@ -125,11 +123,12 @@ class SafetyProjector(Transform):
         self._see = self._look
         if compile:
             self._see = Compiled(self._look, "the projector's look at a state", replay=False)
-        self.latencies = deque[float](maxlen=10_000)
         self.start = float(start)
-        self.action_key = action_key
         self.enabled = start == 0.0  # no tensor: to ask a GPU would be to wait for it
-        self._box: dict[str, Any] | None = None
+
+    @property
+    def reads(self) -> Sequence[NestedKey]:
+        return self.risk.in_keys
 
     def get_extra_state(self) -> bool:
         return self.enabled
@@ -171,22 +170,6 @@ class SafetyProjector(Transform):
         missing = -len(rows) % size
         return torch.cat([rows, rows[-1:].expand(missing)]).split(size)
 
-    def _bounds(self) -> dict[str, Any]:
-        """``low`` and ``high`` of the environment's actions: numbers where all coordinates share them."""
-        if self._box is None:
-            env = self.parent
-            if env is None:
-                raise RuntimeError("SafetyProjector must be appended to an environment.")
-            spec = env.full_action_spec[self.action_key]
-            ends: dict[str, Any] = {"low": -torch.inf, "high": torch.inf}
-            if isinstance(spec, Bounded):
-                ends = {name: getattr(spec.space, name) for name in ends}
-                ends = {name: end.reshape(-1, end.shape[-1])[0] for name, end in ends.items()}
-                if all((end == end[0]).all() for end in ends.values()):
-                    ends = {name: float(end[0]) for name, end in ends.items()}
-            self._box = ends
-        return self._box
-
     @torch.no_grad()
     def correct(self, tensordict: TensorDictBase, **box: Any) -> TensorDict:
         """What is to be executed in place of the proposed action, without an environment.
@@ -226,41 +209,6 @@ class SafetyProjector(Transform):
             },
             inputs.batch_size,
         ).reshape(tensordict.batch_size)
-
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        report = self.correct(tensordict, **self._bounds())
-        # Inner transforms may rescale the action from here on: the report stays in policy units.
-        tensordict.set(_STASH, report)
-        return tensordict.set(self.action_key, report.get("action_executed").clone())
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return next_tensordict.update(tensordict.get(_STASH))
-
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        env = self.container
-        if env is None:
-            raise RuntimeError("SafetyProjector must be appended to an environment.")
-        for key in ("action_executed", *_REPORT):
-            tensordict_reset.set(key, env.full_observation_spec[key].zero())
-        return tensordict_reset
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        env = self.parent
-        if env is None:
-            raise RuntimeError("SafetyProjector must be appended to an environment.")
-        self._box = None  # it may be another environment than before
-        action = env.full_action_spec[self.action_key]
-        report = observation_spec.clone()
-        report["action_executed"] = Unbounded(
-            action.shape, device=action.device, dtype=action.dtype
-        )
-        shape = torch.Size((*report.shape, 1))
-        for key, dtype in _REPORT.items():
-            kind = Binary if dtype is torch.bool else Unbounded
-            report[key] = kind(shape=shape, device=action.device, dtype=dtype)
-        return report
 
 
 class ExecutedAction(Transform):
