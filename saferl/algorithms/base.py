@@ -57,12 +57,13 @@ class Agent:
         return getattr(self.loss, "cost_value", None)
 
     @property
-    def limit(self) -> float | None:
-        """What the risk is to stay below in each state: the projector's, else the loss's; None where nothing limits it there."""
+    def limit(self) -> float | list[float] | None:
+        """What the risk is to stay below in each state, of several costs each: the projector's, else the loss's; None where
+        nothing limits it there."""
         limit = getattr(self.projector, "limit", None)
         if limit is not None:
             return limit
-        return float(getattr(self.loss, "risk_limit", 0.0)) or None
+        return torch.as_tensor(getattr(self.loss, "risk_limit", 0.0)).tolist() or None
 
     @property
     def stored(self) -> tuple[Any, ...]:

@@ -15,8 +15,9 @@ class StateValue(nn.Module):
     Args:
         encoder: maps its inputs to features [*B, width].
         width: size of these features.
+        outputs: K, numbers of a value; more than one of several costs.
 
-    Returns values [*B, 1].
+    Returns values [*B, K].
 
     Examples:
         >>> import torch
@@ -26,10 +27,10 @@ class StateValue(nn.Module):
         torch.Size([5, 1])
     """
 
-    def __init__(self, encoder: nn.Module, width: int):
+    def __init__(self, encoder: nn.Module, width: int, outputs: int = 1):
         super().__init__()
         self.encoder = encoder
-        self.head = nn.Linear(width, 1)
+        self.head = nn.Linear(width, outputs)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         return self.head(self.encoder(*inputs))

@@ -15,7 +15,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torch.utils._pytree import register_pytree_node, tree_map_only
 
-#: What may be made of the values of an ensemble's members, [n, *B, 1] -> [*B, 1].
+#: What may be made of the values of an ensemble's members, [n, *B, N] -> [*B, N].
 REDUCTIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "max": lambda values: values.amax(0),
     "min": lambda values: values.amin(0),
@@ -73,8 +73,9 @@ class BoundCritics:
         scenes: what the members know of the states, with the weights that meet the action: a list
             of one scene for each, or, ``stacked``, one scene of tensors [n, ...], evaluated at once.
         stacked: which of the two.
-        reduce: what a call makes of the members' values [n, *B, K]: ``"max"``, ``"min"``, ``"mean"``, or a
-            function to [*B, 1].
+        reduce: what a call makes of the members' values of each cost, [n, *B, K, N]: ``"max"``, ``"min"``, ``"mean"``, or
+            a function to [*B, K, 1]. N is 1, or the number of quantiles.
+        costs: K, of which the members' N K outputs are, one after the other.
 
     Examples:
         >>> import torch
@@ -92,6 +93,7 @@ class BoundCritics:
     scenes: Any
     stacked: bool = False
     reduce: Reduction = "max"
+    costs: int = 1
 
     @classmethod
     def of(
@@ -102,6 +104,7 @@ class BoundCritics:
         *,
         action_key: NestedKey = "action",
         reduce: Reduction = "max",
+        costs: int = 1,
         vmap: bool | None = None,
     ) -> BoundCritics:
         """Binds critics to the states in ``tensordict``, of which the action is not read.
@@ -111,7 +114,7 @@ class BoundCritics:
             params: the parameters and buffers of all members, with batch size [n].
             tensordict: holds what the critics read.
             action_key: the entry that is the action.
-            reduce: see the class.
+            reduce, costs: see the class.
             vmap: whether to stack the members; by default on a GPU, which they fill together, and where each
                 is small. A core of a CPU is full with one large member.
         """
@@ -135,25 +138,25 @@ class BoundCritics:
         else:
             scenes = [encode(member, states) for member in params.unbind(0)]
         value = network.value if split else _Whole(critic, action_key)  # pyright: ignore
-        return cls(value, scenes, vmap, reduce)
+        return cls(value, scenes, vmap, reduce, costs)
 
     def values(self, action: Tensor) -> Tensor:
-        """The value of each member, [n, *B, 1], for actions [*B, A]."""
+        """The outputs of each member, [n, *B, K N], for actions [*B, A]."""
         if not self.stacked:
             return torch.stack([self.value(scene, action) for scene in self.scenes])
         value = torch.vmap(self.value, (0, None), randomness="different")
         return value(self.scenes, action)
 
     def __call__(self, action: Tensor) -> Tensor:
-        """The members' values reduced to one, [*B, 1]."""
-        values = self.values(action)
+        """The members' values reduced to one of each cost, [*B, K]."""
+        values = self.values(action).unflatten(-1, (self.costs, -1))
         reduced = reduction(self.reduce)(values)
         if reduced.shape != (*values.shape[1:-1], 1):
             raise ValueError(
-                f"reduce must make one number of the members' values, [n, *B, K] -> [*B, 1], got "
+                f"reduce must make one number of the members' values, [n, *B, N] -> [*B, 1], got "
                 f"{tuple(reduced.shape)} of {tuple(values.shape)}."
             )
-        return reduced
+        return reduced.squeeze(-1)
 
     def detach(self) -> BoundCritics:
         """The same, differentiable with respect to the action alone."""
@@ -165,7 +168,7 @@ class BoundCritics:
 # Compiled code tells apart what the critics know of the states and how they use it.
 register_pytree_node(
     BoundCritics,
-    lambda bound: ([bound.scenes], (bound.value, bound.stacked, bound.reduce)),
+    lambda bound: ([bound.scenes], (bound.value, bound.stacked, bound.reduce, bound.costs)),
     lambda scenes, rest: BoundCritics(rest[0], *scenes, *rest[1:]),
 )
 
@@ -184,13 +187,14 @@ class CriticEnsemble(TensorDictModuleBase):
             each call, and they are neither in its ``parameters()`` nor in its ``state_dict()``. It stays in its
             process: in another it would read a copy for ever.
         reduce: ``"max"``, ``"min"`` or ``"mean"`` over the members, or a function of their values
-            [n, *B, K] to [*B, 1], such as :class:`saferl.modules.MeanStd`.
+            [n, *B, N] to [*B, 1], such as :class:`saferl.modules.MeanStd`.
         action_key: the entry that :meth:`bind` leaves open.
+        costs: K, how many costs the members value. Each is reduced by itself.
 
     Attributes:
         params: the live parameters and buffers of all members, with batch size [n].
 
-    Reads the members' ``in_keys``. Writes their ``out_key`` [*B, 1].
+    Reads the members' ``in_keys``. Writes their ``out_key`` [*B, K].
 
     Raises:
         ValueError: if ``reduce`` is unknown, the list is empty, its members read or write different
@@ -224,6 +228,7 @@ class CriticEnsemble(TensorDictModuleBase):
         *,
         reduce: Reduction = "max",
         action_key: NestedKey = "action",
+        costs: int = 1,
     ):
         super().__init__()
         reduction(reduce)
@@ -254,7 +259,7 @@ class CriticEnsemble(TensorDictModuleBase):
             )
         # Only the structure of the template is used: its own weights must not be listed.
         self.__dict__["template"] = template
-        self.reduce = reduce
+        self.reduce, self.costs = reduce, costs
         self.action_key = unravel_key(action_key)
         self.in_keys = list(template.in_keys)
         self.out_keys = [template.out_keys[0]]
@@ -282,7 +287,7 @@ class CriticEnsemble(TensorDictModuleBase):
             )
 
     def bind(self, tensordict: TensorDictBase) -> BoundCritics:
-        """The reduced value in these states as a function of the action alone, [*B, A] -> [*B, 1].
+        """The reduced value in these states as a function of the action alone, [*B, A] -> [*B, K].
 
         Reads the members' ``in_keys`` but for the action. It is valid until the parameters change.
         """
@@ -292,11 +297,12 @@ class CriticEnsemble(TensorDictModuleBase):
             self.params,
             tensordict,
             reduce=self.reduce,
+            costs=self.costs,
             action_key=self.action_key,
         )
 
     def values(self, tensordict: TensorDictBase) -> Tensor:
-        """The value of each member, [n, *B, 1]; writes nothing."""
+        """The outputs of each member, [n, *B, K N]; writes nothing."""
         return self.bind(tensordict).values(tensordict.get(self.action_key))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Self
 
 import torch
 import torch.nn.functional as F
@@ -27,6 +29,9 @@ class LagrangeMultiplier(nn.Module):
     training loop calls :meth:`update` with fresh penalties, once for each update: their mean is the
     Lagrangian's slope in lambda.
 
+    Of several constraints it is a vector [K], which penalties and violations [*B, K] meet in their last dimension. Each
+    is moved by itself.
+
     A state-wise constraint (``signed=False``) counts only the samples that violate it, and its
     multiplier cannot fall (E11, paper). A signed one averages surplus and shortage.
 
@@ -34,7 +39,7 @@ class LagrangeMultiplier(nn.Module):
     ``loss.float()`` would round small updates away.
 
     Args:
-        init: first value.
+        init: first value; of several constraints a list [K].
         signed: whether satisfied samples count against violated ones.
         maximum: upper bound of the value, for safety; infinite by default.
 
@@ -51,28 +56,54 @@ class LagrangeMultiplier(nn.Module):
 
     value: Tensor
 
-    def __init__(self, init: float = 1.0, signed: bool = False, maximum: float = math.inf):
+    def __init__(
+        self, init: float | Sequence[float] = 1.0, signed: bool = False, maximum: float = math.inf
+    ):
         super().__init__()
-        if not maximum >= _check("init", init):
-            raise ValueError(f"maximum must be >= init, got maximum={maximum} and init={init}.")
         # In float32, 1 + 1e-4 * violation is 1 for every violation below 6e-4.
-        self.register_buffer("value", torch.tensor(float(init), dtype=torch.float64))
+        value = torch.tensor(init, dtype=torch.float64).squeeze()
+        for each in value.reshape(-1).tolist():
+            if not maximum >= _check("init", each):
+                raise ValueError(f"maximum must be >= init, got maximum={maximum} and init={init}.")
+        self.register_buffer("value", value)
         self.signed = signed
         self.maximum = float(maximum)
 
+    @property
+    def count(self) -> int:
+        """K, how many constraints it is of."""
+        return self.value.numel()
+
+    def expand(self, count: int) -> Self:
+        """Make it one of ``count`` constraints, in place: its own value serves each, if it has one alone.
+
+        Raises:
+            ValueError: it has another number of values.
+
+        >>> LagrangeMultiplier(init=2.0).expand(3).value
+        tensor([2., 2., 2.], dtype=torch.float64)
+        """
+        if self.count not in (1, count):
+            raise ValueError(f"init must be a number or {count} of them, got {self.count}.")
+        for name, buffer in list(self.named_buffers(recurse=False)):
+            if buffer.shape == self.value.shape and name != "value":
+                self.register_buffer(name, buffer.expand(count).squeeze().clone())
+        self.value = self.value.expand(count).squeeze().clone()
+        return self
+
     def penalty(self, violation: Tensor) -> Tensor:
-        """The term of each sample that lambda multiplies, [*B]: ReLU or identity."""
+        """The term of each sample that lambda multiplies, [*B] or [*B, K]: ReLU or identity."""
         return violation if self.signed else F.relu(violation)
 
     def _mean(self, penalty: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean of the finite entries (float64), and whether there is one."""
-        penalty = penalty.detach().to(self.value)
+        """Mean of the finite entries of each constraint (float64), and whether there is one."""
+        penalty = penalty.detach().to(self.value).reshape(-1, *self.value.shape)
         finite = penalty.isfinite()
-        total = torch.where(finite, penalty, 0.0).sum()
-        return total / finite.sum().clamp(min=1), finite.any()
+        total = torch.where(finite, penalty, 0.0).sum(0)
+        return total / finite.sum(0).clamp(min=1), finite.any(0)
 
     def update(self, penalty: Tensor, elapsed: float = 1.0) -> None:
-        """Moves the multiplier by penalties of any shape, which are averaged; here, not at all.
+        """Moves the multiplier by penalties of any shape ([*B, K] of several constraints), which are averaged; here, not at all.
 
         A loss reports theirs as ``"constraint_violation"``; for violations of your own,
         ``multiplier.update(multiplier.penalty(violation))``. Entries that are not finite are left
@@ -80,7 +111,7 @@ class LagrangeMultiplier(nn.Module):
         multiplier into NaN.
 
         Args:
-            penalty: of any shape.
+            penalty: of any shape; of several constraints [*B, K].
             elapsed: since the last update, in the unit of time that rates are of.
         """
 
@@ -92,7 +123,7 @@ class DualAscent(LagrangeMultiplier):
     default (as E11 prints it: the multiplier can only grow) and the violation itself if ``signed``.
 
     Args:
-        init: first value.
+        init: first value; of several constraints a list [K].
         lr: step size alpha_lambda, for each unit of time.
         signed: whether satisfied samples lower the multiplier.
         maximum: upper bound of the value.
@@ -111,7 +142,7 @@ class DualAscent(LagrangeMultiplier):
 
     def __init__(
         self,
-        init: float = 1.0,
+        init: float | Sequence[float] = 1.0,
         lr: float = 1e-4,
         signed: bool = False,
         maximum: float = math.inf,
@@ -143,7 +174,7 @@ class PIDMultiplier(LagrangeMultiplier):
         kp: gain on the violation.
         ki: gain on its running sum, for each unit of time.
         kd: gain on its increase since the last update.
-        init: first value.
+        init: first value; of several constraints a list [K].
         signed: whether satisfied samples lower the multiplier; Stooke et al. do so.
         maximum: upper bound of the value and of the integral.
         smoothing: time over which e_s averages e; 0: not at all.
@@ -174,7 +205,7 @@ class PIDMultiplier(LagrangeMultiplier):
         kp: float = 0.1,
         ki: float = 0.01,
         kd: float = 0.01,
-        init: float = 0.0,
+        init: float | Sequence[float] = 0.0,
         signed: bool = True,
         maximum: float = math.inf,
         smoothing: float = 0.0,
@@ -185,7 +216,7 @@ class PIDMultiplier(LagrangeMultiplier):
         self.kp, self.ki, self.kd = _check("kp", kp), _check("ki", ki), _check("kd", kd)
         if self.kp == self.ki == self.kd == 0:
             raise ValueError("At least one of kp, ki and kd must be > 0, got 0, 0 and 0.")
-        if exponential and init < LEAST:
+        if exponential and bool((self.value < LEAST).any()):
             raise ValueError(f"init must be >= {LEAST} where exponential, got {init}.")
         if not swing > 0:
             raise ValueError(f"swing must be > 0, got {swing}.")
@@ -193,7 +224,7 @@ class PIDMultiplier(LagrangeMultiplier):
         self.exponential = exponential
         self.register_buffer("integral", self.value.log() if exponential else self.value.clone())
         self.register_buffer("previous", torch.zeros_like(self.value))
-        self.register_buffer("started", torch.tensor(False))
+        self.register_buffer("started", torch.zeros_like(self.value, dtype=torch.bool))
 
     @torch.no_grad()
     def update(self, penalty: Tensor, elapsed: float = 1.0) -> None:

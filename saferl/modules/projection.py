@@ -23,11 +23,11 @@ class ProjectionResult:
 
     Attributes:
         action: the action to execute [*B, A].
-        risk_before: risk of the given action [*B].
-        risk_after: risk of the returned action [*B].
+        risk_before: risk of the given action [*B]; of several costs their risks [*B, K].
+        risk_after: risk of the returned action, likewise.
         steps: number of gradient steps taken [*B], int64.
         intervened: whether the returned action differs from the given one [*B].
-        feasible: whether ``risk_after <= limit`` [*B].
+        feasible: whether ``risk_after <= limit``, of every cost [*B].
     """
 
     action: Tensor
@@ -39,33 +39,42 @@ class ProjectionResult:
 
 
 class _Descent(NamedTuple):
-    """Where each sample stands; all but the actions [*B, A] are [*B]."""
+    """Where each sample stands; all but the actions [*B, A] and the risks [*B, K] are [*B]."""
 
     action: Tensor
-    slope: Tensor  # dQ_c/da there
+    slope: Tensor  # of the worst risk there
     risk: Tensor
     active: Tensor
     steps: Tensor
     safest: Tensor
-    least: Tensor
+    least: Tensor  # the risk of the safest action
 
 
-def _evaluate(risk_fn: Callable[[Tensor], Tensor], action: Tensor) -> tuple[Tensor, Tensor]:
-    """Risk [*B] of each action and its gradient [*B, A]."""
+def _worst(risk: Tensor, shift: Tensor) -> Tensor:
+    """The risk [*B] that exceeds its limit most, as if all had the least one: ``shift`` [K] is that minus theirs."""
+    return (risk + shift).amax(-1)
+
+
+def _evaluate(
+    risk_fn: Callable[[Tensor], Tensor], action: Tensor, shift: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Risks [*B, K] of each action, and the gradient [*B, A] of the worst."""
+    count = len(shift)
     with torch.enable_grad():
         action = action.detach().requires_grad_()
         risk = risk_fn(action)
-        if risk.shape == (*action.shape[:-1], 1):
-            risk = risk.squeeze(-1)
-        if risk.shape != action.shape[:-1]:
+        if risk.shape == action.shape[:-1]:
+            risk = risk.unsqueeze(-1)
+        if risk.shape != (*action.shape[:-1], count):
             raise ValueError(
                 f"risk_fn must return a risk of shape {tuple(action.shape[:-1])} or "
-                f"{(*action.shape[:-1], 1)} for actions of shape {tuple(action.shape)}, got "
+                f"{(*action.shape[:-1], count)} for actions of shape {tuple(action.shape)}, got "
                 f"{tuple(risk.shape)}."
             )
         if not risk.requires_grad:  # no action changes it
             return risk, torch.zeros_like(action)
-        (slope,) = torch.autograd.grad(risk.sum(), action, materialize_grads=True)
+        worst = _worst(risk, shift).sum()
+        (slope,) = torch.autograd.grad(worst, action, materialize_grads=True)
     return risk.detach(), slope
 
 
@@ -73,7 +82,8 @@ def _descend(
     risk_fn: Callable[[Tensor], Tensor],
     at: _Descent,
     start: Tensor,
-    limit: float,
+    limit: Tensor,
+    shift: Tensor,
     steps: int,
     step_size: float,
     penalty: float,
@@ -92,16 +102,17 @@ def _descend(
         scale = torch.where(active, step_size / norm, 0.0).unsqueeze(-1)
         moved = (at.action - scale * gradient).clamp(low, high)  # pyright: ignore
         action = torch.where(active.unsqueeze(-1), moved, at.action)
-        risk, slope = _evaluate(risk_fn, action)
-        better = active & (risk < at.least)
+        risk, slope = _evaluate(risk_fn, action, shift)
+        worst = _worst(risk, shift)
+        better = active & (worst < _worst(at.least, shift))
         at = _Descent(
             action=action,
             slope=slope,
             risk=risk,
-            active=active & (risk > limit),
+            active=active & (worst > limit),
             steps=at.steps + active,
             safest=torch.where(better.unsqueeze(-1), action, at.safest),
-            least=torch.where(better, risk, at.least),
+            least=torch.where(better.unsqueeze(-1), risk, at.least),
         )
     return at
 
@@ -113,7 +124,7 @@ _compiled_descend = Compiled(_descend, "the projection", replay=False)
 def project(
     risk_fn: Callable[[Tensor], Tensor],
     action: Tensor,
-    limit: float,
+    limit: float | Tensor,
     *,
     steps: int = 50,
     step_size: float = 0.02,
@@ -124,6 +135,8 @@ def project(
     compile: bool = False,
 ) -> ProjectionResult:
     """Moves risky actions until their risk is at most ``limit`` (paper, E8 to E10).
+
+    Of several costs the risk is that which exceeds its limit most: at each step another one may be.
 
     Each sample whose risk exceeds ``limit`` takes up to ``steps`` steps
 
@@ -148,10 +161,10 @@ def project(
     path bends towards the steepest descent: feasible, but farther from a_init than a*.
 
     Args:
-        risk_fn: maps actions [*B, A] to risks [*B] or [*B, 1], each sample for itself. It must be
-            differentiable by autograd; its parameters receive no gradient.
+        risk_fn: maps actions [*B, A] to risks [*B] or [*B, 1] ([*B, K] of several costs), each sample for itself. It must
+            be differentiable by autograd; its parameters receive no gradient.
         action: a_init [*B, A], in the units of ``low`` and ``high``.
-        limit: d_thres, the largest allowed risk.
+        limit: d_thres, the largest allowed risk; of several costs a tensor [K].
         steps: N_iter, the largest number of steps.
         step_size: eta, the largest move of a coordinate in a step.
         penalty: lambda_a, the weight of the excess risk against the distance to a_init.
@@ -182,35 +195,38 @@ def project(
     """
     _check_arguments(limit, steps, step_size, penalty, keep, low, high)
     start = action.detach()
+    limits = torch.as_tensor(limit, dtype=torch.float64).to(start).reshape(-1)
+    least = limits.amin()
+    shift = torch.where(limits == least, 0.0, least - limits)  # an infinite one limits nothing
     evaluate, descend, together = _evaluate, _descend, 1
     if compile:
         if not isinstance(risk_fn, BoundCritics):
             raise ValueError(f"compile=True needs BoundCritics as risk_fn, got {risk_fn!r}.")
         evaluate, descend, together = _compiled_evaluate, _compiled_descend, _TOGETHER
-    risk_before, slope = evaluate(risk_fn, start)
-    none = torch.zeros_like(risk_before, dtype=torch.int64)
-    risky = risk_before > limit
+    risk_before, slope = evaluate(risk_fn, start, shift)
+    risky = _worst(risk_before, shift) > least
+    none = torch.zeros_like(risky, dtype=torch.int64)
     at = _Descent(start, slope, risk_before, risky, none, start, risk_before)
     for done in range(0, steps, together):
         # To ask a GPU would be to wait for it.
         if start.device.type == "cpu" and not at.active.any():
             break
         count = min(together, steps - done)
-        at = descend(risk_fn, at, start, limit, count, step_size, penalty, low, high)
+        at = descend(risk_fn, at, start, least, shift, count, step_size, penalty, low, high)
 
     current, risk_after = at.action, at.risk
     if keep == "safest":
-        stuck = (risk_after > limit) | risk_after.isnan()
-        current = torch.where(stuck.unsqueeze(-1), at.safest, current)
+        stuck = ~(_worst(risk_after, shift) <= least).unsqueeze(-1)  # NaN, too
+        current = torch.where(stuck, at.safest, current)
         risk_after = torch.where(stuck, at.least, risk_after)
     intervened = (current != start).any(-1)
-    return ProjectionResult(
-        current, risk_before, risk_after, at.steps, intervened, risk_after <= limit
-    )
+    feasible = _worst(risk_after, shift) <= least
+    risks = risk_before.squeeze(-1), risk_after.squeeze(-1)
+    return ProjectionResult(current, *risks, at.steps, intervened, feasible)
 
 
 def _check_arguments(
-    limit: float,
+    limit: float | Tensor,
     steps: int,
     step_size: float,
     penalty: float,
@@ -220,7 +236,7 @@ def _check_arguments(
 ) -> None:
     if torch.is_inference_mode_enabled():
         raise RuntimeError("project needs gradients: use torch.no_grad, not inference_mode.")
-    if math.isnan(limit):
+    if not isinstance(limit, Tensor) and math.isnan(limit):  # to ask a GPU would be to wait for it
         raise ValueError("limit must be a number, got nan.")
     if steps < 0:
         raise ValueError(f"steps must be >= 0, got {steps}.")

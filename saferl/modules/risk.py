@@ -1,6 +1,7 @@
-"""What the members of an ensemble of cost critics make a risk of, [n, *B, K] -> [*B, 1].
+"""What the members of an ensemble of cost critics make a risk of, [n, *B, N] -> [*B, 1].
 
-K is 1, or the number of quantiles of a distributional critic, whose mean is the expected cost.
+N is 1, or the number of quantiles of a distributional critic, whose mean is the expected cost. Of several costs each is
+given by itself: they are a dimension of B.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class MeanStd:
 class CVaR:
     """The mean cost of the worst cases, as the largest of the members says (WCSAC, Yang et al., 2021).
 
-    Of K quantiles at (i + 1/2) / K each stands for 1 / K of the cases; those beyond ``level`` count.
+    Of N quantiles at (i + 1/2) / N each stands for 1 / N of the cases; those beyond ``level`` count.
 
     Attributes:
         level: in [0, 1); 0 is the expected cost.

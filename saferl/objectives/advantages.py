@@ -81,6 +81,7 @@ class CostValueMixin(LossMixin):
     #: Entries that it reads, by their names in ``tensor_keys``.
     input_entries: ClassVar[tuple[str, ...]]
 
+    costs: int
     cost_critic: TensorDictModule
     cost_critic_params: TensorDictParams
     target_cost_critic_params: TensorDictParams
@@ -90,8 +91,9 @@ class CostValueMixin(LossMixin):
     critic_network_params: TensorDictParams
     target_critic_network_params: TensorDictParams
 
-    def add_cost_value(self, cost_critic: TensorDictModule) -> None:
-        """Take the cost critic in, and make the estimators, by the names that the two values have."""
+    def add_cost_value(self, cost_critic: TensorDictModule, costs: int = 1) -> None:
+        """Take the cost critic of so many costs in, and make the estimators, by the names that the two values have."""
+        self.costs = costs
         self.convert_to_functional(cost_critic, "cost_critic")
         self.set_keys(
             value=written(self.critic_network, self.tensor_keys.value),
@@ -127,32 +129,38 @@ class CostValueMixin(LossMixin):
         Args:
             tensordict: ``[*B, T]``.
 
-        Reads the value networks' inputs at the root and under ``"next"``; under ``"next"``: ``"reward"``, ``"cost"``
-            ``[*B, T, 1]`` in their units, ``"done"``, ``"terminated"`` ``[*B, T, 1]``.
-        Writes ``"state_value"``, ``"advantage"``, ``"value_target"`` in the unit of the reward; ``"state_cost_value"``,
-            ``"cost_advantage"``, ``"cost_value_target"`` in the unit of the cost; all ``[*B, T, 1]``.
+        Reads the value networks' inputs at the root and under ``"next"``; under ``"next"``: ``"reward"`` ``[*B, T, 1]`` and
+            ``"cost"`` ``[*B, T, K]`` in their units, ``"done"``, ``"terminated"`` ``[*B, T, 1]``.
+        Writes ``"state_value"``, ``"advantage"``, ``"value_target"`` in the unit of the reward ``[*B, T, 1]``;
+            ``"state_cost_value"``, ``"cost_advantage"``, ``"cost_value_target"`` in the units of the costs ``[*B, T, K]``.
 
         Raises:
             KeyError: the batch holds no cost.
+            ValueError: it holds another number of costs than the loss has constraints.
         """
-        check_cost(tensordict, self.tensor_keys.cost)
+        keys = self.tensor_keys
+        check_cost(tensordict, keys.cost, self.costs)
         score_actions(self, tensordict)
-        for estimator, params, target_params in (
-            (
-                self.value_estimator,
-                self.critic_network_params,
-                self.target_critic_network_params,
-            ),
-            (
-                self._cost_value_estimator,
-                self.cost_critic_params,
-                self.target_cost_critic_params,
-            ),
-        ):
-            estimator(tensordict, params=params.detach(), target_params=target_params)
+        self.value_estimator(
+            tensordict,
+            params=self.critic_network_params.detach(),
+            target_params=self.target_critic_network_params,
+        )
+        # Estimators want one shape of all.
+        costs = tensordict.clone(False)
+        following = costs.get("next").clone(False)
+        done = following.get(keys.done)
+        following.set(keys.done, done.expand(*done.shape[:-1], self.costs))
+        self._cost_value_estimator(
+            costs.set("next", following),
+            params=self.cost_critic_params.detach(),
+            target_params=self.target_cost_critic_params,
+        )
+        names = (keys.state_cost_value, keys.cost_advantage, keys.cost_value_target)
+        tensordict.update(costs.select(*names))
 
     def cost_loss(self, tensordict: TensorDictBase) -> Tensor:
-        """Half the squared error of V_c(s) against ``"cost_value_target"``, reduced.
+        """Half the squared error of V_c(s) against ``"cost_value_target"``, summed over the costs and reduced.
 
         Args:
             tensordict: ``[*B]`` as :meth:`begin` leaves it.
@@ -165,5 +173,5 @@ class CostValueMixin(LossMixin):
             inputs = tensordict.select(*self.cost_critic.in_keys)
             predicted = self.cost_critic(inputs).get(self.tensor_keys.state_cost_value)
         target = tensordict.get(self.tensor_keys.cost_value_target)
-        loss = 0.5 * distance_loss(predicted, target, loss_function="l2").squeeze(-1)
+        loss = 0.5 * distance_loss(predicted, target, loss_function="l2").sum(-1)
         return self.reduced(loss, tensordict)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, get_args
 
 import torch
@@ -12,6 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from saferl.modules import LagrangeMultiplier
+from saferl.modules.limits import as_limit
 
 
 def check_choice(name: str, value: Any, choices: Any) -> Any:
@@ -25,15 +25,16 @@ def check_choice(name: str, value: Any, choices: Any) -> Any:
     return value
 
 
-def check_limit(name: str, limit: float) -> float:
-    """A limit on costs, in their unit.
+def check_limit(name: str, limit: float | Sequence[float], count: int) -> Tensor:
+    """A limit on each of ``count`` costs in their units, float32: a scalar that serves all, or [count].
 
     Raises:
-        ValueError: it is negative or not finite; names it.
+        ValueError: one is negative or not finite, or they are not as many; names it.
     """
-    if not (math.isfinite(limit) and limit >= 0):
-        raise ValueError(f"{name} must be >= 0, got {limit}.")
-    return float(limit)
+    for each in torch.as_tensor(limit).reshape(-1):
+        if not (each.isfinite() and each >= 0):
+            raise ValueError(f"{name} must be >= 0, got {limit}.")
+    return as_limit(name, limit, count).float()
 
 
 def check_gamma(hyperparams: dict[str, Any]) -> None:
@@ -47,13 +48,20 @@ def check_gamma(hyperparams: dict[str, Any]) -> None:
         raise ValueError(f"gamma must be in [0, 1], got {gamma}.")
 
 
-def check_cost(tensordict: TensorDictBase, key: NestedKey) -> None:
-    """That a batch ``[*B]`` holds a cost under ``"next"``.
+def check_cost(tensordict: TensorDictBase, key: NestedKey, count: int) -> None:
+    """That a batch ``[*B]`` holds ``count`` costs under ``"next"``.
 
     Raises:
         KeyError: it does not; tells what is there.
+        ValueError: they are not as many.
     """
-    if tensordict.get(("next", key), None) is None:
+    cost = tensordict.get(("next", key), None)
+    if cost is not None and cost.shape[-1] != count:
+        raise ValueError(
+            f"{('next', key)} must be {[*tensordict.shape, count]}, as many costs as the loss has constraints, got "
+            f"{[*cost.shape]}."
+        )
+    if cost is None:
         raise KeyError(
             f"The batch has no entry {('next', key)}; under 'next' it has "
             f"{sorted(map(str, tensordict.get('next').keys()))}. "
@@ -86,7 +94,7 @@ def check_lagrange(lagrange: Any) -> LagrangeMultiplier:
 
 
 def check_risk(risk: Any) -> Callable[[Tensor], Tensor]:
-    """What makes a risk [*B, 1] of the members' values [n, *B, K], by trying it.
+    """What makes a risk [*B, 1] of the members' values [n, *B, N], by trying it.
 
     Raises:
         ValueError: it is no function, or makes something else.
@@ -95,7 +103,7 @@ def check_risk(risk: Any) -> Callable[[Tensor], Tensor]:
         shape = tuple(risk(torch.zeros(2, 3, 1)).shape)
     except Exception as error:
         raise ValueError(
-            f"risk must be a function, such as saferl.modules.Largest(), of values [n, *B, K], got {risk!r}."
+            f"risk must be a function, such as saferl.modules.Largest(), of values [n, *B, N], got {risk!r}."
         ) from error
     if shape != (3, 1):
         raise ValueError(

@@ -5,7 +5,7 @@ E13 is equation (11) of the paper, `arXiv 2503.19690 <https://arxiv.org/abs/2503
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -42,7 +42,7 @@ def quantile_loss(predicted: Tensor, target: Tensor) -> Tensor:
     its usual width of 1, and within it a minimum is an expectile.
 
     Args:
-        predicted: [*B, K], the quantiles at (i + 1/2) / K, in the unit of the cost.
+        predicted: [*B, N], the quantiles at (i + 1/2) / N, in the unit of the cost.
         target: [*B, L], samples of the distribution, equally likely.
 
     Returns:
@@ -50,7 +50,7 @@ def quantile_loss(predicted: Tensor, target: Tensor) -> Tensor:
     """
     count = predicted.shape[-1]
     fraction = (torch.arange(count, device=predicted.device, dtype=predicted.dtype) + 0.5) / count
-    error = target.unsqueeze(-2) - predicted.unsqueeze(-1)  # [*B, K, L]
+    error = target.unsqueeze(-2) - predicted.unsqueeze(-1)  # [*B, N, L]
     fraction = fraction.unsqueeze(-1)
     return torch.maximum(fraction * error, (fraction - 1.0) * error).mean(-1).sum(-1)
 
@@ -88,7 +88,9 @@ class CostCriticMixin(LossMixin):
       by chance is too high, and each target passes that on to the next one.
     - ``cost_backup="reach"`` has the target :math:`(1 - \gamma) c + \gamma \max(c, (1 - \tau) Q_c^-)`. Its fixed point
       is the discounted largest cost ahead (Fisac et al., 2019).
-    - A critic with K > 1 outputs learns the quantiles of the sum, by :func:`quantile_loss`.
+    - With a multiplier of K constraints there are K costs, and a critic has an output for each. :math:`L_c` is summed over
+      them.
+    - A critic with N > 1 outputs for each cost learns the quantiles of the sum, by :func:`quantile_loss`.
     - ``risk`` is what is made of the members' values everywhere else.
     """
 
@@ -115,7 +117,7 @@ class CostCriticMixin(LossMixin):
         num_cost_critics: int | None,
         *,
         lagrange: LagrangeMultiplier,
-        risk_limit: float,
+        risk_limit: float | Sequence[float],
         cost_target: CostTarget,
         cost_backup: CostBackup,
         risk: Callable[[Tensor], Tensor] | None,
@@ -123,7 +125,8 @@ class CostCriticMixin(LossMixin):
         compare_against: list[nn.Parameter] | None,
     ) -> None:
         """Take the cost critics in, with what their loss and the actor's need, and make the estimators."""
-        risk_limit = check_limit("risk_limit", risk_limit)
+        self.lagrange = check_lagrange(lagrange)
+        limit = check_limit("risk_limit", risk_limit, self.lagrange.count)
         self.num_cost_critics = count_members(
             "cost_critic", cost_critic, "num_cost_critics", num_cost_critics
         )
@@ -137,8 +140,7 @@ class CostCriticMixin(LossMixin):
             create_target_params=create_target_params,
             compare_against=compare_against,
         )
-        self.lagrange = check_lagrange(lagrange)
-        self.register_coeff_buffer("risk_limit", risk_limit, device=self.buffer_device)
+        self.register_buffer("risk_limit", limit.to(self.buffer_device))
         # Asked for now, so that a fresh loss loads a state_dict strictly.
         _ = self.value_estimator
 
@@ -177,6 +179,7 @@ class CostCriticMixin(LossMixin):
             self.cost_critic,
             params=self.cost_critic_params,
             reduce=self.risk,
+            costs=self.lagrange.count,
             action_key=self.tensor_keys.action,
         )
 
@@ -222,8 +225,10 @@ class CostCriticMixin(LossMixin):
 
         Raises:
             KeyError: the batch holds no cost.
+            ValueError: it holds another number of costs than the loss has constraints.
         """
-        check_cost(tensordict, self.tensor_keys.cost)
+        count = self.lagrange.count
+        check_cost(tensordict, self.tensor_keys.cost, count)
         next_state, _ = self.next_sample(tensordict)
         with torch.no_grad():
             target_critics = self.bind(self.cost_critic, self.target_cost_critic_params, next_state)
@@ -232,21 +237,19 @@ class CostCriticMixin(LossMixin):
             target = self.backup(tensordict, next_value)
         critics = self.critics("cost_critic", tensordict)
         predicted = critics.values(tensordict.get(self.tensor_keys.action))
-        if predicted.shape[-1] == 1:
+        if predicted.shape[-1] == count:
             return self.bellman_loss(predicted, target, tensordict)
-        loss = quantile_loss(predicted, target.expand_as(predicted)).sum(0)
-        error = predicted.mean(-1) - target.mean(-1)
-        return self.reduced(loss, tensordict), {"td_error": error.detach().abs().max(0)[0]}
+        predicted, target = (each.unflatten(-1, (count, -1)) for each in (predicted, target))
+        loss = quantile_loss(predicted, target.expand_as(predicted)).sum(-1).sum(0)
+        error = (predicted.mean(-1) - target.mean(-1)).detach().abs()
+        return self.reduced(loss, tensordict), {"td_error": error.amax(-1).max(0)[0]}
 
     def backup(self, tensordict: TensorDictBase, next_value: Tensor) -> Tensor:
-        """The cost critics' target [*B, K] from the next state's values [*B, K]."""
+        """The cost critics' target [*B, K N] from the next state's values [*B, K N]."""
+        tensordict = self.spread(tensordict, next_value.shape[-1])
         estimator = self._cost_value_estimator
         if self.cost_backup == "sum":
-            data, keys = tensordict.copy(), self.tensor_keys
-            following = data.get("next").copy()
-            for key in (keys.cost, keys.done, keys.terminated):  # estimators want one shape of all
-                following.set(key, following.get(key).expand_as(next_value))
-            return estimator.value_estimate(data.set("next", following), next_value=next_value)
+            return estimator.value_estimate(tensordict, next_value=next_value)
         if "steps_to_next_obs" in tensordict.keys():  # noqa: SIM118
             raise ValueError('cost_backup="reach" is of single steps, got "steps_to_next_obs".')
         cost = tensordict.get(("next", self.tensor_keys.cost))
@@ -254,12 +257,22 @@ class CostCriticMixin(LossMixin):
         gamma, ahead = estimator.gamma.to(cost), torch.where(terminated, 0.0, next_value)
         return (1.0 - gamma) * cost + gamma * torch.maximum(cost, ahead)
 
+    def spread(self, tensordict: TensorDictBase, size: int) -> TensorDictBase:
+        """A copy of a batch in which cost and ends ``[*B, size]`` meet values: estimators want one shape of all."""
+        data, keys = tensordict.copy(), self.tensor_keys
+        following = data.get("next").copy()
+        cost = following.get(keys.cost)
+        each = cost.unsqueeze(-1).expand(*cost.shape, size // cost.shape[-1])
+        following.set(keys.cost, each.flatten(-2))
+        for key in (keys.done, keys.terminated):
+            following.set(key, following.get(key).expand(*cost.shape[:-1], size))
+        return data.set("next", following)
+
     def bellman_loss(
         self, predicted: Tensor, target: Tensor, tensordict: TensorDictBase
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Half the squared error of ``predicted`` ``[n, *B, 1]``, summed over its members."""
-        predicted = predicted.squeeze(-1)
-        target = target.squeeze(-1).expand_as(predicted)
-        loss = 0.5 * distance_loss(predicted, target, loss_function="l2").sum(0)
-        error = (predicted - target).detach().abs().max(0)[0]
-        return self.reduced(loss, tensordict), {"td_error": error}
+        """Half the squared error of ``predicted`` ``[n, *B, K]``, summed over its members and numbers."""
+        target = target.expand_as(predicted)
+        loss = 0.5 * distance_loss(predicted, target, loss_function="l2").sum(-1).sum(0)
+        error = (predicted - target).detach().abs().amax(-1)
+        return self.reduced(loss, tensordict), {"td_error": error.max(0)[0]}

@@ -52,7 +52,8 @@ class CPOLoss(CostValueMixin, PPOLoss):
         cost_critic (TensorDictModule): V_c(s).
 
     Keyword Args:
-        cost_limit (float, optional): d, a bound on the mean cost of an episode, undiscounted. Defaults to ``0.05``.
+        cost_limit (float, optional): d, a bound on the mean cost of an episode, undiscounted; of one cost, as the step has
+            one constraint. Defaults to ``0.05``.
         trust (float, optional): delta, on the mean KL. Defaults to ``0.01``.
         cg_steps (int, optional): conjugate-gradient iterations. Defaults to ``15``.
         damping (float, optional): added to H's diagonal. Defaults to ``0.1``.
@@ -73,7 +74,8 @@ class CPOLoss(CostValueMixin, PPOLoss):
         ``"cpo_recoverable"``, ``"cpo_infeasible"``.
 
     Raises:
-        ValueError: a setting is out of range; ``gamma`` lies outside [0, 1].
+        ValueError: a setting is out of range; ``cost_limit`` is of several costs, or a batch's cost is; ``gamma`` lies outside
+            [0, 1].
         KeyError: the batch holds no cost or no ``is_init``; ``begin`` has not seen it.
 
     Examples:
@@ -140,6 +142,12 @@ class CPOLoss(CostValueMixin, PPOLoss):
                 raise ValueError(f"{name} must be >= 1, got {value}.")
         if not 0 <= margin_rate <= 1:
             raise ValueError(f"margin_rate must be in [0, 1], got {margin_rate}.")
+        if torch.as_tensor(cost_limit).numel() != 1:
+            raise ValueError(
+                f"cost_limit must be one number, as CPO's step has one constraint, got {cost_limit}: take PPOLagLoss "
+                "(algo=ppo_lag) for several."
+            )
+        limit = check_limit("cost_limit", cost_limit, 1)
         if not 0 < backtrack < 1:
             raise ValueError(f"backtrack must be in (0, 1), got {backtrack}.")
         super().__init__(
@@ -153,8 +161,7 @@ class CPOLoss(CostValueMixin, PPOLoss):
         )
         self.add_cost_value(cost_critic)
         device = self.buffer_device
-        limit = check_limit("cost_limit", cost_limit)
-        self.register_coeff_buffer("cost_limit", limit, device=device)
+        self.register_buffer("cost_limit", limit.to(device))
         self.out_keys = ["loss_critic", "loss_cost", "explained_variance", "kl", "cost_estimate"]
         self.out_keys += ["step_fraction", *(f"cpo_{name}" for name in CASES)]
         self.trust, self.cg_steps, self.damping = trust, cg_steps, damping

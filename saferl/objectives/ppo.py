@@ -24,12 +24,13 @@ class PPOLagLoss(CostValueMixin, ClipPPOLoss):
 
     .. math::
 
-        A &= (A_r - \lambda A_c) / (1 + \lambda), \quad \hat A = (A - \bar A) / \mathrm{std}(A) \\
+        A &= (A_r - \sum \lambda A_c) / (1 + \sum \lambda), \quad \hat A = (A - \bar A) / \mathrm{std}(A) \\
         L_\pi &= -E[\min(\rho \hat A, \mathrm{clip}(\rho, 1 - \epsilon, 1 + \epsilon) \hat A)] \\
         L_c &= E[\tfrac12 (V_c(s) - G_c)^2]
 
     with :math:`\rho` the ratio of the new policy's probability to that of the policy that acted. The advantages are
-    weighed first, and their sum is standardised: the multiplier stays in units of reward per cost.
+    weighed first, and their sum is standardised: the multiplier stays in units of reward per cost. Sums are over K
+    constraints, of which :math:`A_c`, :math:`V_c` and :math:`\lambda` are vectors.
 
     The multiplier is not trained here. A loop moves it once for each batch of fresh episodes, with
     ``loss.lagrange.update(loss.lagrange.penalty(episode_cost - limit))``.
@@ -37,10 +38,10 @@ class PPOLagLoss(CostValueMixin, ClipPPOLoss):
     Args:
         actor_network (ProbabilisticTensorDictSequential): the policy.
         critic_network (TensorDictModule): V(s).
-        cost_critic (TensorDictModule): V_c(s).
+        cost_critic (TensorDictModule): V_c(s), with K outputs.
 
     Keyword Args:
-        lagrange (LagrangeMultiplier): the multiplier, saved with the loss.
+        lagrange (LagrangeMultiplier): the multiplier, saved with the loss. Its number of values is K.
         normalize_advantage (bool, optional): standardise the weighed advantage over each batch that the loss is given.
             Defaults to ``True``.
         clip_epsilon, entropy_bonus, entropy_coeff, critic_coeff, clip_value, loss_critic_type, separate_losses,
@@ -49,12 +50,13 @@ class PPOLagLoss(CostValueMixin, ClipPPOLoss):
 
     Reads what :meth:`begin` leaves in a batch, in any batch shape ``[*B]``: the networks' inputs; ``"action"``
         ``[*B, A]``, the policy's own, and its ``"action_log_prob"`` ``[*B]``; ``"advantage"`` and ``"value_target"`` in the
-        unit of the reward, ``"cost_advantage"`` and ``"cost_value_target"`` in the unit of the cost, ``[*B, 1]``.
+        unit of the reward ``[*B, 1]``, ``"cost_advantage"`` and ``"cost_value_target"`` in the units of the costs ``[*B, K]``.
     Writes ``"loss_objective"``, ``"loss_critic"``, ``"loss_cost"``: scalars, or ``[*B]`` without reduction; the reports of
-        :class:`~torchrl.objectives.ClipPPOLoss`; the scalar ``"lagrange_multiplier"`` (reward per cost).
+        :class:`~torchrl.objectives.ClipPPOLoss`; ``"lagrange_multiplier"`` (reward per cost), a scalar, or ``[K]``.
 
     Raises:
-        ValueError: ``clip_epsilon`` is not positive; ``lagrange`` is no multiplier; ``gamma`` lies outside [0, 1].
+        ValueError: ``clip_epsilon`` is not positive; ``lagrange`` is no multiplier; ``gamma`` lies outside [0, 1]; a batch has
+            another number of costs than ``lagrange`` has values.
         KeyError: the batch holds no cost; ``begin`` has not seen it.
 
     Examples:
@@ -124,8 +126,8 @@ class PPOLagLoss(CostValueMixin, ClipPPOLoss):
             separate_losses=separate_losses,
             reduction=reduction,
         )
-        self.add_cost_value(cost_critic)
         self.lagrange = check_lagrange(lagrange)
+        self.add_cost_value(cost_critic, self.lagrange.count)
         self.out_keys = [*self.out_keys, "loss_cost", "lagrange_multiplier"]
 
     @dispatch()
@@ -135,8 +137,9 @@ class PPOLagLoss(CostValueMixin, ClipPPOLoss):
         reward = tensordict.get(self.tensor_keys.advantage)
         cost = tensordict.get(self.tensor_keys.cost_advantage)
         multiplier = self.lagrange.value.detach().to(reward)
+        priced = (multiplier * cost).sum(-1, keepdim=True)
         weighed = tensordict.clone(False)
-        weighed.set(self.tensor_keys.advantage, (reward - multiplier * cost) / (1.0 + multiplier))
+        weighed.set(self.tensor_keys.advantage, (reward - priced) / (1.0 + multiplier.sum()))
         out = super().forward(weighed)
         out.set("loss_cost", self.cost_loss(tensordict))
         out.set("lagrange_multiplier", self.lagrange.value.detach().clone())
@@ -174,7 +177,7 @@ class RiskPPOLoss(PPOLagLoss):
         risk_critic (list of TensorDictModule): the members of Q_c(s, a), at least two.
 
     Keyword Args:
-        risk (callable, optional): what :attr:`cost_value` makes of the members' values ``[n, *B, K]``. Defaults to
+        risk (callable, optional): what :attr:`cost_value` makes of the members' values of a cost ``[n, *B, N]``. Defaults to
             :class:`~saferl.modules.Largest`.
         **settings: as in :class:`PPOLagLoss`.
 
@@ -260,6 +263,7 @@ class RiskPPOLoss(PPOLagLoss):
             self.risk_critic,
             params=self.risk_critic_params,
             reduce=self.risk,
+            costs=self.lagrange.count,
             action_key=self.tensor_keys.action,
         )
 
@@ -271,9 +275,10 @@ class RiskPPOLoss(PPOLagLoss):
         return out
 
     def risk_loss(self, tensordict: TensorDictBase) -> Tensor:
-        """The loss of Q_c(s, a), summed over its members and reduced.
+        """The loss of Q_c(s, a), summed over its members and the costs and reduced.
 
-        Half the squared error against ``"cost_value_target"``, or, of critics with K > 1 outputs, :func:`quantile_loss`.
+        Half the squared error against ``"cost_value_target"``, or, of critics with N > 1 outputs for each cost,
+        :func:`quantile_loss`.
 
         Args:
             tensordict: ``[*B]`` as :meth:`begin` leaves it.
@@ -289,7 +294,9 @@ class RiskPPOLoss(PPOLagLoss):
         )
         predicted = critics.values(action)
         target = tensordict.get(keys.cost_value_target)
-        if predicted.shape[-1] > 1:
-            return self.reduced(quantile_loss(predicted, target).sum(0), tensordict)
-        loss = 0.5 * distance_loss(predicted, target.expand_as(predicted), loss_function="l2")
-        return self.reduced(loss.sum(0).squeeze(-1), tensordict)
+        if predicted.shape[-1] > target.shape[-1]:
+            predicted = predicted.unflatten(-1, (target.shape[-1], -1))
+            loss = quantile_loss(predicted, target.unsqueeze(-1))
+        else:
+            loss = 0.5 * distance_loss(predicted, target.expand_as(predicted), loss_function="l2")
+        return self.reduced(loss.sum(-1).sum(0), tensordict)

@@ -6,7 +6,7 @@ their labels there.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -51,6 +51,8 @@ class SACLagLoss(CostCriticMixin, SACTerms):
       the mean.
     - E12 and E13 share the action :math:`\tilde a'`, which the policy proposes. They use target critics.
 
+    Of K constraints :math:`c`, :math:`Q_c`, :math:`d` and :math:`\lambda` are vectors, and the terms with them sums.
+
     The gradient of a term reaches its own parameters only. The four may be summed and stepped together.
 
     The multiplier is not trained here. A loop ascends it with ``loss.lagrange.update(output["constraint_violation"])``:
@@ -60,19 +62,19 @@ class SACLagLoss(CostCriticMixin, SACTerms):
         actor_network (ProbabilisticTensorDictSequential): the policy.
         qvalue_network (TensorDictModule or list of TensorDictModule): the reward critic. One module is copied for each
             member and drawn anew. A list gives the members, with the parameters that they have.
-        cost_critic (TensorDictModule or list of TensorDictModule): likewise for the cost.
+        cost_critic (TensorDictModule or list of TensorDictModule): likewise for the cost, with K outputs.
 
     Keyword Args:
-        lagrange (LagrangeMultiplier): the multiplier, saved with the loss.
-        risk_limit (float, optional): d, a bound on the risk in each state, the discounted cost ahead. Defaults to
-            ``0.05``.
+        lagrange (LagrangeMultiplier): the multiplier, saved with the loss. Its number of values is K.
+        risk_limit (float or list of float, optional): d, a bound on the risk in each state, the discounted cost ahead; of
+            several costs one for each, or one for all. Defaults to ``0.05``.
         cost_target ("max" or "mean", optional): what :math:`Q_c^-` is of the members of the target. Defaults to
             ``"max"`` (paper), whose overestimate feeds itself.
         cost_backup ("sum" or "reach", optional): what the cost critics learn, the discounted sum of costs (paper) or
             the largest one ahead. Defaults to ``"sum"``.
-        risk (callable, optional): what :math:`Q_c(s, \tilde a)` is of the members' values ``[n, *B, K]``. Defaults to
+        risk (callable, optional): what :math:`Q_c(s, \tilde a)` is of the members' values of a cost ``[n, *B, N]``. Defaults to
             :class:`~saferl.modules.Largest` (paper).
-        rescale (bool, optional): divide the actor's term by :math:`1 + \lambda`. Defaults to ``False`` (paper).
+        rescale (bool, optional): divide the actor's term by :math:`1 + \sum \lambda`. Defaults to ``False`` (paper).
         alpha_weight ("alpha" or "log_alpha", optional): what weighs the temperature's term. ``"alpha"`` is E14.
             ``"log_alpha"`` is :class:`~torchrl.objectives.SACLoss`, whose slope in :math:`\log\alpha` lacks the factor
             :math:`\alpha`. Defaults to ``"alpha"`` (paper).
@@ -83,14 +85,15 @@ class SACLagLoss(CostCriticMixin, SACTerms):
             deactivate_vmap, use_prioritized_weights, scalar_output_mode: as in :class:`~torchrl.objectives.SACLoss`.
 
     Reads the networks' inputs at the root and under ``"next"``; ``"action"`` ``[*B, A]``; under ``"next"`` ``"reward"``
-        and ``"cost"`` ``[*B, 1]`` in their units, ``"done"`` and ``"terminated"`` ``[*B, 1]``. Where terminated, the
+        ``[*B, 1]`` and ``"cost"`` ``[*B, K]`` in their units, ``"done"`` and ``"terminated"`` ``[*B, 1]``. Where terminated, the
         next observation is not used and may be NaN.
     Writes ``"loss_actor"``, ``"loss_qvalue"``, ``"loss_cost"``, ``"loss_alpha"`` and ``"constraint_violation"``, in the
         unit of the cost: scalars, or ``[*B]`` without reduction; the scalars ``"alpha"``, ``"entropy"`` (nats),
-        ``"lagrange_multiplier"`` (reward per cost). Into the batch: ``"td_error"`` ``[*B]`` of the reward critics.
+        ``"lagrange_multiplier"`` (reward per cost). With K > 1 ``"constraint_violation"`` and ``"lagrange_multiplier"`` have
+        one more dimension ``[K]``. Into the batch: ``"td_error"`` ``[*B]`` of the reward critics.
 
     Raises:
-        ValueError: ``risk_limit`` is negative or not finite; a number of critics is below one; critics come as a list
+        ValueError: ``risk_limit`` is negative or not finite, or of another K than ``lagrange``, or a batch's cost is; a number of critics is below one; critics come as a list
             of one; ``cost_target``, ``cost_backup`` or ``alpha_weight`` is unknown; ``risk`` is no function;
             ``lagrange`` is no multiplier; ``gamma`` lies outside [0, 1]; a batch has multi-step transitions with
             ``cost_backup="reach"``.
@@ -151,7 +154,7 @@ class SACLagLoss(CostCriticMixin, SACTerms):
         cost_critic: TensorDictModule | list[TensorDictModule],
         *,
         lagrange: LagrangeMultiplier,
-        risk_limit: float = 0.05,
+        risk_limit: float | Sequence[float] = 0.05,
         cost_target: CostTarget = "max",
         cost_backup: CostBackup = "sum",
         risk: Callable[[Tensor], Tensor] | None = None,
@@ -241,21 +244,24 @@ class SACLagLoss(CostCriticMixin, SACTerms):
             tensordict: the batch ``[*B]``.
 
         Returns:
-            The loss, reduced; ``"log_prob"`` ``[*B]`` and ``"constraint_violation"``, reduced, but never by a sum.
+            The loss, reduced; ``"log_prob"`` ``[*B]`` and ``"constraint_violation"``, reduced, but never by a sum; of several
+            constraints each by itself.
         """
         reward = self.critics("qvalue_network", tensordict).detach()
-        cost = replace(self.critics("cost_critic", tensordict).detach(), reduce=self.risk)
+        cost = self.critics("cost_critic", tensordict).detach()
+        cost = replace(cost, reduce=self.risk, costs=self.lagrange.count)
         sample, log_prob = self.sample_action(tensordict)
         action = sample.get(self.tensor_keys.action)
         qvalue = reward.values(action).min(0)[0]
-        penalty = self.lagrange.penalty(cost(action).squeeze(-1) - self.risk_limit)
+        penalty = self.lagrange.penalty(cost(action) - self.risk_limit)
         multiplier = self.lagrange.value.detach().to(penalty)
-        loss = self.temperature * log_prob - qvalue.squeeze(-1) + multiplier * penalty
+        loss = self.temperature * log_prob - qvalue.squeeze(-1) + (multiplier * penalty).sum(-1)
         if self.rescale:
-            loss = loss / (1.0 + multiplier)
+            loss = loss / (1.0 + multiplier.sum())
         # The multiplier's step must not grow with the batch, even under "sum".
         kept = "none" if self.reduction == "none" else "mean"
-        violation = self.reduced(penalty.detach(), tensordict, kept)
+        each = [self.reduced(one, tensordict, kept) for one in penalty.detach().unbind(-1)]
+        violation = torch.stack(each, -1).squeeze(-1)
         if (shared := self.shared(tensordict)) is not None:
             shared.violation = violation
         metadata = {"log_prob": log_prob.detach(), "constraint_violation": violation}

@@ -198,7 +198,7 @@ def test_errors():
         CriticEnsemble([one, two], reduce="median")
     with pytest.raises(ValueError, match=r"or a function, got None"):
         CriticEnsemble([one, two], reduce=None)  # type: ignore
-    with pytest.raises(ValueError, match=r"to?.*one number .* got \(5,\) of \(2, 5, 1\)"):
+    with pytest.raises(ValueError, match=r"to?.*one number .* got \(5, 1\) of \(2, 5, 1, 1\)"):
         CriticEnsemble([one, two], reduce=lambda v: v.amax(0).squeeze(-1))(scene())
     with pytest.raises(ValueError, match="at least one critic"):
         CriticEnsemble([])

@@ -26,12 +26,12 @@ class Correction(Transform):
         action_key: the entry of the proposed action.
 
     Attributes:
-        reports: what it writes under ``next`` beside ``action_executed`` [*B, A], each [*B, 1], with its kind. All are
+        reports: what it writes under ``next`` beside ``action_executed`` [*B, A], each [*B, N], with its kind and N. All are
             zero after a reset.
         latencies: seconds that each of the last 10,000 corrections took.
     """
 
-    reports: Mapping[str, torch.dtype] = {"intervened": torch.bool}
+    reports: Mapping[str, tuple[torch.dtype, int]] = {"intervened": (torch.bool, 1)}
 
     def __init__(self, action_key: NestedKey = "action"):
         super().__init__()
@@ -101,8 +101,8 @@ class Correction(Transform):
         report["action_executed"] = Unbounded(
             action.shape, device=action.device, dtype=action.dtype
         )
-        shape = torch.Size((*report.shape, 1))
-        for key, dtype in self.reports.items():
+        for key, (dtype, size) in self.reports.items():
             kind = Binary if dtype is torch.bool else Unbounded
+            shape = torch.Size((*report.shape, size))
             report[key] = kind(shape=shape, device=action.device, dtype=dtype)
         return report

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,13 +15,14 @@ from torchrl.envs.transforms import Transform
 
 from saferl.envs.transforms.correction import Correction
 from saferl.modules.compiled import Compiled
+from saferl.modules.limits import as_limit
 from saferl.modules.projection import project
 
 _ROWS = 32  # corrected together in compiled code
 
 
 class SafetyProjector(Correction):
-    """Executes a corrected action wherever the risk of the proposed one exceeds a limit.
+    """Executes a corrected action wherever the risk of the proposed one exceeds a limit; of several risks, where any does.
 
     The correction is :func:`saferl.modules.project` (paper, E8 to E10) on the risk
     Q_c(s, a) that ``risk`` predicts, within the box of the environment's action spec. Append it
@@ -32,10 +33,11 @@ class SafetyProjector(Correction):
 
     Args:
         risk: a TensorDictModule that reads observation entries and the action and writes the risk
-            [*B, 1] under its first ``out_key``. If it has a ``bind(tensordict)`` method that returns
+            [*B, K], of each of K costs, under its first ``out_key``. If it has a ``bind(tensordict)`` method that returns
             :class:`saferl.modules.BoundCritics` (as :class:`saferl.modules.CriticEnsemble` does), what
             does not depend on the action is computed once for all steps.
-        limit: d_thres, the largest risk that is left alone.
+        limit: d_thres, the largest risk that is left alone; of several costs a list [K], and the one that exceeds its own
+            most is lowered.
         steps: N_iter, the largest number of correction steps.
         step_size: eta, the largest move of a coordinate in a step, in the units of the action.
         penalty: lambda_a, see :func:`saferl.modules.project`.
@@ -51,10 +53,10 @@ class SafetyProjector(Correction):
         enabled: whether it corrects yet.
 
     Reads the action and the observation at the time of a step. Writes under ``next``:
-    ``action_executed`` [*B, A]; ``risk_before`` and ``risk_after`` [*B, 1], the risks of the
+    ``action_executed`` [*B, A]; ``risk_before`` and ``risk_after`` [*B, K], the risks of the
     proposed and the executed action; ``projection_steps`` [*B, 1] (float32); ``intervened``
     [*B, 1] (bool), whether the two actions differ; ``feasible`` [*B, 1] (bool), whether the
-    executed one is within the limit. All are zero after a reset. While disabled, actions pass
+    executed one is within every limit. All are zero after a reset. While disabled, actions pass
     unchanged and the risks are still reported.
 
     Raises:
@@ -77,18 +79,12 @@ class SafetyProjector(Correction):
         True
     """
 
-    reports: ClassVar[Mapping[str, torch.dtype]] = {
-        "risk_before": torch.float32,
-        "risk_after": torch.float32,
-        "projection_steps": torch.float32,
-        **Correction.reports,
-        "feasible": torch.bool,
-    }
+    _limit: Tensor
 
     def __init__(
         self,
         risk: TensorDictModuleBase,
-        limit: float,
+        limit: float | Sequence[float],
         *,
         steps: int = 50,
         step_size: float = 0.02,
@@ -106,7 +102,15 @@ class SafetyProjector(Correction):
                 f"risk must be a TensorDictModule that reads {self.action_key!r}, got {risk}."
             )
         self.risk = risk
-        self.limit = float(limit)
+        self.register_buffer("_limit", as_limit("limit", limit), persistent=False)
+        risks = self._limit.numel()
+        self.reports = {
+            "risk_before": (torch.float32, risks),
+            "risk_after": (torch.float32, risks),
+            "projection_steps": (torch.float32, 1),
+            **Correction.reports,
+            "feasible": (torch.bool, 1),
+        }
         self.settings: dict[str, Any] = {
             "steps": steps,
             "step_size": step_size,
@@ -114,7 +118,9 @@ class SafetyProjector(Correction):
             "keep": keep,
         }
         # Refuses bad settings now and not in the middle of a run.
-        project(lambda action: action.sum(-1), torch.zeros(0, 1), self.limit, **self.settings)
+        project(
+            lambda action: action.expand(0, risks), torch.zeros(0, 1), self._limit, **self.settings
+        )
         if compile and not hasattr(risk, "bind"):
             raise ValueError(
                 f"compile=True needs a risk with bind(), as CriticEnsemble; set compile=False for {risk}."
@@ -130,6 +136,11 @@ class SafetyProjector(Correction):
     def reads(self) -> Sequence[NestedKey]:
         return self.risk.in_keys
 
+    @property
+    def limit(self) -> float | list[float]:
+        """As given: a number, or one for each cost."""
+        return self._limit.tolist()
+
     def get_extra_state(self) -> bool:
         return self.enabled
 
@@ -141,7 +152,7 @@ class SafetyProjector(Correction):
         self.enabled = fraction >= self.start
 
     def _look(self, inputs: TensorDictBase) -> tuple[Callable[[Tensor], Tensor], Tensor]:
-        """The risk [N, 1] as a function of the action alone [N, A], and that of the action given [N]."""
+        """The risk [N, K] as a function of the action alone [N, A], and that of the action given."""
         bind, action = getattr(self.risk, "bind", None), inputs.get(self.action_key)
         if bind is None:
 
@@ -151,7 +162,7 @@ class SafetyProjector(Correction):
 
         else:
             of_action = bind(inputs).detach()
-        return of_action, of_action(action).reshape(-1)
+        return of_action, of_action(action).reshape(len(action), self._limit.numel())
 
     def _in_parts(self, risky: Tensor) -> Sequence[Tensor | slice]:
         """The rows to correct, a slice where these are all. A GPU corrects all at once, where the
@@ -185,27 +196,29 @@ class SafetyProjector(Correction):
         action = inputs.get(self.action_key)
 
         risk, before = self._see(inputs)
-        executed, after, steps = action.clone(), before.clone(), torch.zeros_like(before)
-        parts = self._in_parts(before > self.limit) if self.enabled else []
+        limit = self._limit.to(before)
+        executed, after, steps = action.clone(), before.clone(), torch.zeros_like(before[:, 0])
+        parts = self._in_parts((before > limit).any(-1)) if self.enabled else []
         if len(parts):
             begin = time.perf_counter()
             for rows in parts:
                 # Only the risky samples are worth up to `steps` evaluations.
                 if isinstance(rows, Tensor):
                     risk, _ = self._see(inputs[rows])
-                result = project(risk, action[rows], self.limit, **self.settings, **box)
-                executed[rows], after[rows] = result.action, result.risk_after
+                result = project(risk, action[rows], limit, **self.settings, **box)
+                executed[rows] = result.action
+                after[rows] = result.risk_after.reshape(-1, limit.numel())
                 steps[rows] = result.steps.to(steps)
             self.latencies.append(time.perf_counter() - begin)
 
         return TensorDict(
             {
                 "action_executed": executed,
-                "risk_before": before.float().unsqueeze(-1),
-                "risk_after": after.float().unsqueeze(-1),
+                "risk_before": before.float(),
+                "risk_after": after.float(),
                 "projection_steps": steps.float().unsqueeze(-1),
                 "intervened": (executed != action).any(-1, keepdim=True),
-                "feasible": (after <= self.limit).unsqueeze(-1),
+                "feasible": (after <= limit).all(-1, keepdim=True),
             },
             inputs.batch_size,
         ).reshape(tensordict.batch_size)

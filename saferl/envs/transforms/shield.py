@@ -106,7 +106,7 @@ class Shield(Correction):
         self.names, self.fallbacks = [*fallbacks], torch.nn.ModuleList(fallbacks.values())
         self.horizon, self.margin, self.frequency = float(horizon), float(margin), frequency
         self.name, self.first = name, first
-        own = {"feasible": torch.bool, "fallback": torch.int64}
+        own = {"feasible": (torch.bool, 1), "fallback": (torch.int64, 1)}
         self.reports = {**(first or Correction).reports, **own}
 
     @property
@@ -115,7 +115,7 @@ class Shield(Correction):
         return (*dict.fromkeys((*(self.first.reads if self.first else ()), *own)),)
 
     @property
-    def limit(self) -> float | None:
+    def limit(self) -> float | list[float] | None:
         """The risk that ``first`` leaves alone, if it has one."""
         return getattr(self.first, "limit", None)
 
