@@ -113,7 +113,7 @@ class OnPolicy(OnPolicyLearning, Algorithm):
         )
         return Epochs(
             buffer,
-            stored=(*agent.stored, *ADVANTAGES),
+            stored=(*agent.stored, *ADVANTAGES, *agent.loss.in_keys),
             begin=learner.begin,
             epochs=self.epochs,
             reward_scale=self.reward_scale,

@@ -8,6 +8,7 @@ from saferl.modules.exploration import HeldActions
 from saferl.modules.lagrange import DualAscent, LagrangeMultiplier, PIDMultiplier
 from saferl.modules.mlp import MLP, MLPPolicyEncoder, MLPValue
 from saferl.modules.mmam import MMAM, MMAMPolicyEncoder, MMAMValue
+from saferl.modules.penalty import ExactPenalty, Switch
 from saferl.modules.projection import ProjectionResult, project
 from saferl.modules.risk import CVaR, Largest, MeanStd
 from saferl.modules.scene import EGO_SCALE, VEHICLE_SCALE
@@ -23,6 +24,7 @@ __all__ = [
     "CriticEnsemble",
     "DualAscent",
     "Encoder",
+    "ExactPenalty",
     "GaussianHead",
     "HeldActions",
     "LagrangeMultiplier",
@@ -38,6 +40,7 @@ __all__ = [
     "SetPolicyEncoder",
     "SetValue",
     "StateValue",
+    "Switch",
     "project",
     "tanh_gaussian_actor",
     "value_operator",

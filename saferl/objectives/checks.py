@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -12,6 +12,8 @@ from torch import Tensor
 
 from saferl.modules import LagrangeMultiplier
 from saferl.modules.limits import as_limit
+
+Multiplier = TypeVar("Multiplier", bound=LagrangeMultiplier)
 
 
 def check_choice(name: str, value: Any, choices: Any) -> Any:
@@ -82,14 +84,14 @@ def check_begun(tensordict: TensorDictBase, key: NestedKey) -> None:
         )
 
 
-def check_lagrange(lagrange: Any) -> LagrangeMultiplier:
-    """A multiplier.
+def check_lagrange(lagrange: Any, kind: type[Multiplier] = LagrangeMultiplier) -> Multiplier:
+    """A multiplier of a kind.
 
     Raises:
         ValueError: it is something else.
     """
-    if not isinstance(lagrange, LagrangeMultiplier):
-        raise ValueError(f"lagrange must be a LagrangeMultiplier, got {lagrange!r}.")
+    if not isinstance(lagrange, kind):
+        raise ValueError(f"lagrange must be a {kind.__name__}, got {lagrange!r}.")
     return lagrange
 
 

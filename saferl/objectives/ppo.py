@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
@@ -92,6 +92,11 @@ class PPOLagLoss(CostValueMixin, ClipPPOLoss):
         *("cost_advantage", "cost_value_target"),
     )
 
+    #: The kind of multiplier that it takes.
+    multiplier: ClassVar[type[LagrangeMultiplier]] = LagrangeMultiplier
+    #: What :meth:`policy_terms` writes beside ``"loss_objective"``.
+    terms: ClassVar[tuple[str, ...]] = ()
+
     lagrange: LagrangeMultiplier
 
     def __init__(
@@ -126,9 +131,9 @@ class PPOLagLoss(CostValueMixin, ClipPPOLoss):
             separate_losses=separate_losses,
             reduction=reduction,
         )
-        self.lagrange = check_lagrange(lagrange)
+        self.lagrange = check_lagrange(lagrange, self.multiplier)
         self.add_cost_value(cost_critic, self.lagrange.count)
-        self.out_keys = [*self.out_keys, "loss_cost", "lagrange_multiplier"]
+        self.out_keys = [*self.out_keys, *self.terms, "loss_cost", "lagrange_multiplier"]
 
     @dispatch()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -136,15 +141,28 @@ class PPOLagLoss(CostValueMixin, ClipPPOLoss):
             check_begun(tensordict, key)
         reward = tensordict.get(self.tensor_keys.advantage)
         cost = tensordict.get(self.tensor_keys.cost_advantage)
-        multiplier = self.lagrange.value.detach().to(reward)
-        priced = (multiplier * cost).sum(-1, keepdim=True)
         weighed = tensordict.clone(False)
-        weighed.set(self.tensor_keys.advantage, (reward - priced) / (1.0 + multiplier.sum()))
+        weighed.set(self.tensor_keys.advantage, self.weigh(reward, cost))
         out = super().forward(weighed)
+        out.update(self.policy_terms(weighed))
         out.set("loss_cost", self.cost_loss(tensordict))
         out.set("lagrange_multiplier", self.lagrange.value.detach().clone())
         self.release(tensordict, out, "cost_critic_params", "target_cost_critic_params")
         return out
+
+    def weigh(self, reward: Tensor, cost: Tensor) -> Tensor:
+        """What the policy improves ``[*B, 1]``, of the advantages of the reward ``[*B, 1]`` and of the costs ``[*B, K]``."""
+        multiplier = self.lagrange.value.detach().to(reward)
+        priced = (multiplier * cost).sum(-1, keepdim=True)
+        return (reward - priced) / (1.0 + multiplier.sum())
+
+    def policy_terms(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        """Terms of the policy beside, or in place of, the clipped ``"loss_objective"``; here none.
+
+        Args:
+            tensordict: ``[*B]``, whose ``"advantage"`` is what :meth:`weigh` made.
+        """
+        return {}
 
 
 @dataclass

@@ -8,15 +8,29 @@ from torchrl.objectives import ValueEstimators
 
 from saferl.modules import (
     DualAscent,
+    ExactPenalty,
     MLPPolicyEncoder,
     StateValue,
+    Switch,
     tanh_gaussian_actor,
     value_operator,
 )
-from saferl.objectives import CPOLoss, PPOLagLoss
+from saferl.objectives import CPOLoss, CRPOLoss, FOCOPSLoss, P3OLoss, PPOLagLoss
 
 GAMMA, LAMBDA, SIZE = 0.9, 0.8, 3
-LOSSES = {"ppo_lag": PPOLagLoss, "cpo": CPOLoss}
+LOSSES = {
+    "ppo_lag": PPOLagLoss,
+    "cpo": CPOLoss,
+    "crpo": CRPOLoss,
+    "focops": FOCOPSLoss,
+    "p3o": P3OLoss,
+}
+MULTIPLIERS = {
+    "ppo_lag": lambda: DualAscent(init=0.7),
+    "crpo": Switch,
+    "focops": lambda: DualAscent(init=0.7),
+    "p3o": ExactPenalty,
+}
 
 
 def encoder() -> MLPPolicyEncoder:
@@ -32,8 +46,8 @@ def build(kind: str = "ppo_lag", seed: int = 0, **settings):
     torch.manual_seed(seed)
     actor = tanh_gaussian_actor(encoder(), 8, 2, in_keys=["observation"]).double()
     parts = actor, value("state_value").double(), value("state_cost_value").double()
-    if kind == "ppo_lag":
-        settings = {"lagrange": DualAscent(init=0.7)} | settings
+    if kind in MULTIPLIERS:
+        settings = {"lagrange": MULTIPLIERS[kind]()} | settings
     loss = LOSSES[kind](*parts, **settings)
     loss.make_value_estimator(ValueEstimators.GAE, gamma=GAMMA, lmbda=LAMBDA)
     return loss, actor

@@ -1,4 +1,4 @@
-"""What PPO-Lagrangian and CPO have in common, against loops and hand-made formulas."""
+"""What PPO-Lagrangian, CPO and their kin have in common, against loops and hand-made formulas."""
 
 from __future__ import annotations
 
@@ -116,6 +116,7 @@ def test_terms_reach_their_own_parameters(kind: str):
         "loss_objective": "actor_network_params",
         "loss_critic": "critic_network_params",
         "loss_cost": "cost_critic_params",
+        "loss_penalty": "actor_network_params",
     }
     for term, owner in reach.items():
         if term not in out.keys():  # noqa: SIM118
