@@ -174,9 +174,7 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
     if cfg.init and not begun(run):  # a run that goes on has its own networks
         begin_from(agent, algorithm.architecture(parts), Path(cfg.init), cfg.device)
     sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
-    transforms: list[Any] = [sums, *algorithm.transforms()]
-    if agent.projector is not None:
-        transforms.append(agent.projector)
+    transforms: list[Any] = [sums, *algorithm.transforms(), *agent.transforms]
     make_env = partial(build_env, cfg.env, parts.task, device=parts.device)
     env = make_env(num_envs, cfg.seed, transforms=transforms)
     collector = Collector(

@@ -17,7 +17,7 @@ from torchrl.objectives import LossModule
 from saferl.algorithms.networks import NetworkBuilder, critic_options, refuse_options
 from saferl.algorithms.parts import Parts, make, takes
 from saferl.envs.task import Task
-from saferl.envs.transforms import Correction
+from saferl.envs.transforms import Correction, Saute
 from saferl.modules import CriticEnsemble, CVaR, MeanStd
 from saferl.training.learner import Learner
 from saferl.training.trainer import Experience
@@ -39,17 +39,24 @@ class Agent:
         observed: keys of the observation that the networks read.
         loss: owns the live parameters of all networks, targets, temperature and multiplier.
         projector: what corrects its actions, such as a :class:`SafetyProjector` on the loss's live cost critics, or None.
+        transform: a :class:`Saute` of the task, or None.
     """
 
     actor: TensorDictModuleBase
     observed: tuple[str, ...]
     loss: LossModule
     projector: Correction | None
+    transform: Saute | None = None
+
+    @property
+    def wraps(self) -> list[Transform]:
+        """What makes the task the one that the policy knows."""
+        return [] if self.transform is None else [self.transform]
 
     @property
     def transforms(self) -> list[Transform]:
-        """What the policy drives with."""
-        return [] if self.projector is None else [self.projector]
+        """What the policy drives with, from the inside outwards."""
+        return [*self.wraps, *([] if self.projector is None else [self.projector])]
 
     @property
     def risk(self) -> CriticEnsemble | None:
@@ -202,7 +209,10 @@ class Algorithm(ABC):
             ValueError: parts that do not go together.
         """
         self.check(parts)
-        networks, accepted = NetworkBuilder(parts), parts.takes
+        transform = None
+        if parts.transform is not None and parts.transform._target_ is not None:
+            transform = make(parts.transform, in_key=parts.task.vector)
+        networks, accepted = NetworkBuilder(parts, transform), parts.takes
         actor = networks.actor(self.initial_std)
         settings = {
             "actor_network": lambda: actor,
@@ -221,7 +231,7 @@ class Algorithm(ABC):
             alone.pop("first", None)
             given = {"risk": loss.cost_value} if takes(node, "risk") else {}
             projector = make(alone, **given, **({"first": projector} if projector else {}))
-        return Agent(actor, tuple(networks.observed), loss, projector)
+        return Agent(actor, tuple(networks.observed), loss, projector, transform)
 
     def optimizer(self, loss: LossModule) -> torch.optim.Optimizer:
         """Adam with one group each for actor, critics and temperature, and their schedules."""

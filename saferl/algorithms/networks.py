@@ -9,6 +9,7 @@ from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 
 from saferl.algorithms.parts import Parts, make, offered
+from saferl.envs.transforms import Saute
 from saferl.modules import Encoder, tanh_gaussian_actor, value_operator, zero_output
 
 #: Options of a critic of action values, and what they are where nothing is said.
@@ -20,12 +21,17 @@ class NetworkBuilder:
 
     Args:
         parts: of the agent.
+        transform: what widens the task's observation, if anything does.
     """
 
-    def __init__(self, parts: Parts):
+    def __init__(self, parts: Parts, transform: Saute | None = None):
         self.parts = parts
-        node = parts.encoder
-        self.encoder: Encoder = make(node, offered(node, parts.task))
+        node, network = parts.encoder, parts.task.network
+        self.widened: dict[str, str] = {}
+        if transform is not None:
+            network = parts.task.widened(transform.count)
+            self.widened = {parts.task.vector: str(transform.out_key)}
+        self.encoder: Encoder = make(node, offered(node, network))
         self.observed: list[str] = []
 
     def reads(self, network: Any) -> tuple[str, ...]:
@@ -40,6 +46,7 @@ class NetworkBuilder:
                 f"{type(network).__name__} reads {', '.join(keys)}, but task={task.task} observes "
                 f"{', '.join(task.observed)}: set encoder=mlp, or an algorithm with one (rsac, sac, ...)."
             )
+        keys = tuple(self.widened.get(key) or key for key in keys)
         self.observed += [key for key in keys if key not in self.observed]
         return keys
 

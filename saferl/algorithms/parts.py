@@ -58,12 +58,12 @@ def make(node: DictConfig, settings: Mapping[str, Any] | None = None, **objects:
     return made
 
 
-def offered(node: DictConfig, task: Task) -> dict[str, Any]:
-    """What a task offers to a network and its configuration leaves open, as far as the network takes it."""
+def offered(node: DictConfig, network: Mapping[str, Any]) -> dict[str, Any]:
+    """What a task offers to a network (``Task.network``) and its configuration leaves open, as far as the network takes it."""
     accepted = arguments(node._target_)
     return {
         key: value
-        for key, value in task.network.items()
+        for key, value in network.items()
         if key not in node and (accepted is None or key in accepted)
     }
 
@@ -80,7 +80,8 @@ class Parts:
 
     Attributes:
         task: what is learned.
-        encoder, critic, cost_critic, risk, loss, lagrange, projector: nodes of these groups.
+        encoder, critic, cost_critic, risk, loss, lagrange, projector, transform: nodes of these groups; a run of an
+            older version has no transform.
         gamma: discount.
         device: of everything.
     """
@@ -93,18 +94,28 @@ class Parts:
     loss: DictConfig
     lagrange: DictConfig
     projector: DictConfig
+    transform: DictConfig | None
     gamma: float
     device: torch.device
 
     @classmethod
     def of(cls, cfg: DictConfig) -> Parts:
         """The parts of a run's configuration."""
-        groups = ("encoder", "critic", "cost_critic", "risk", "loss", "lagrange", "projector")
+        groups = (
+            "encoder",
+            "critic",
+            "cost_critic",
+            "risk",
+            "loss",
+            "lagrange",
+            "projector",
+            "transform",
+        )
         return cls(
             task=make(cfg.task),
             gamma=cfg.gamma,
             device=device_of(cfg.device),
-            **{group: cfg[group] for group in groups},
+            **{group: cfg.get(group) for group in groups},
         )
 
     @property

@@ -52,6 +52,7 @@ class Candidate:
         name: what to call it.
         policy: acts.
         transforms: what it drives with.
+        projects: whether a projector is among them.
         critics: Q_c(s, a) that it has learned, if it has, and their ``limit``.
         about: what else is known of its training.
         origin: what a trace says of it.
@@ -60,6 +61,7 @@ class Candidate:
     name: str
     policy: TensorDictModuleBase
     transforms: Sequence[Transform] = ()
+    projects: bool = False
     critics: TensorDictModuleBase | None = None
     limit: float | None = None
     about: Mapping[str, Any] = field(default_factory=dict)
@@ -76,20 +78,22 @@ class Candidate:
             project: whether it drives with its projector, if it has one.
         """
         agent = trained_agent(cfg, path)
-        transforms = agent.transforms if project else ()
+        projects = project and agent.projector is not None
         about = {"cost_limit": cfg.cost_limit}
         origin = {"algo": cfg.algo_name, "training_seed": cfg.seed}
         if not project and agent.projector is not None:
             origin["algo"] += " unprojected"
-        who = cls(name, agent.actor, transforms, agent.risk, agent.limit, about, origin)
+        transforms = agent.transforms if projects else agent.wraps
+        who = cls(name, agent.actor, transforms, projects, agent.risk, agent.limit, about, origin)
         return who.called(cfg.projector.get("name")) if project else who
 
     def behind(self, node: DictConfig) -> Candidate:
         """The same with a projector behind its own, which has the last word; itself where the node is of none."""
         if node.get("_target_") is None:
             return self
-        own: dict[str, Any] = {"first": self.transforms[0]} if self.transforms else {}
-        who = replace(self, transforms=[make(node, **own)])
+        *wraps, own = self.transforms if self.projects else [*self.transforms, None]
+        given: dict[str, Any] = {} if own is None else {"first": own}
+        who = replace(self, transforms=[*wraps, make(node, **given)], projects=True)
         return who.called(node.get("name"))
 
     def called(self, name: str | None) -> Candidate:
@@ -290,7 +294,7 @@ def choose_policy(
     cfg = on_its_own_task(cfg, trained, overrides)
     task, learned = make(cfg.task), make(trained.task)
     task.check_policy_of(learned)
-    for key, value in offered(trained.encoder, learned).items():
+    for key, value in offered(trained.encoder, learned.network).items():
         if task.network[key] != value:
             raise ValueError(
                 f"task.{key} must be {value}, the number that this policy's network was trained with, "
@@ -328,7 +332,7 @@ def measure(
         policy=who.name,
         env=backend,
         **task.describe(),
-        project=bool(who.transforms),
+        project=who.projects,
         episodes=episodes,
         seed=seed,
         **who.about,

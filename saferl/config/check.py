@@ -30,6 +30,7 @@ PARTS = {
     "lagrange.multiplier": "saferl.modules.LagrangeMultiplier",
     "lagrange.signal": "saferl.training.signals.Signal",
     "projector": "torchrl.envs.Transform",
+    "transform": "saferl.envs.transforms.Saute",
     "logger.sinks": "torchrl.record.loggers.Logger",
 }
 

@@ -227,6 +227,7 @@ class Training:
     loss: dict[str, Any] = field(default_factory=dict)
     lagrange: Lagrange = field(default_factory=Lagrange)
     projector: dict[str, Any] = field(default_factory=dict)
+    transform: dict[str, Any] = field(default_factory=dict)
     logger: Logger = field(default_factory=Logger)
     seed: int = MISSING
     device: str = MISSING

@@ -55,7 +55,11 @@ class Cart(Task):
                 raise ValueError(f"task.{name} must be >= {least}, got {getattr(self, name)}.")
 
     def sums(
-        self, gain: np.ndarray, gamma: float, horizon: float = math.inf
+        self,
+        gain: np.ndarray,
+        gamma: float,
+        horizon: float = math.inf,
+        moment: np.ndarray | None = None,
     ) -> tuple[float, float]:
         """Expected discounted reward and cost of the policy u = -gain x, which must not reach the box.
 
@@ -63,9 +67,10 @@ class Cart(Task):
             gain: [2].
             gamma: discount; 1 with a finite horizon is a sum.
             horizon: decisions.
+            moment: [2, 2], E[x x^T] at the start; that of the task's own starts by default.
         """
         closed = _A - _B @ gain[None]
-        moment = np.eye(2) * self.spread**2 / 3
+        moment = np.eye(2) * self.spread**2 / 3 if moment is None else moment
         shock = np.diag([0.0, self.noise**2 / 3])
         reward = cost = 0.0
         weight, steps = 1.0, min(horizon, math.ceil(40 / max(1 - gamma, 1e-9)))

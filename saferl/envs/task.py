@@ -28,6 +28,7 @@ class Task:
         demonstrators: names of the drivers whose transitions a replay buffer may begin with.
         in_tests: what a test changes in these settings.
         pictures: whether :meth:`draw` draws.
+        vector: the entry of an observation [size] that every network reads.
     """
 
     task: str
@@ -38,6 +39,7 @@ class Task:
     demonstrators: ClassVar[Sequence[str]] = ()
     in_tests: ClassVar[Mapping[str, Any]] = {}
     pictures: ClassVar[bool] = False
+    vector: ClassVar[str] = "observation"
 
     @property
     def observed(self) -> Mapping[str, tuple[int, ...]]:
@@ -48,6 +50,10 @@ class Task:
     def network(self) -> Mapping[str, Any]:
         """What a network may be built from, by the names of its arguments: sizes, feature scales."""
         return {"size": self.size, "action_dim": self.action_dim}
+
+    def widened(self, count: int) -> Mapping[str, Any]:
+        """:attr:`network` where so many numbers of size 1 stand behind :attr:`vector`."""
+        return {**self.network, "size": self.size + count}
 
     @property
     def title(self) -> str:

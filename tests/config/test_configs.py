@@ -71,6 +71,7 @@ def test_every_file_is_an_option_of_a_known_group():
     assert groups == {
         "algo", "cost_critic", "critic", "encoder", "env", "experiment", "hydra", "lagrange",
         "learning", "logger", "loss", "projector", "recipe", "risk", "shaping", "task",
+        "transform",
     }  # fmt: skip
     assert not list(ROOT.rglob("__init__.py"))  # a package of YAML would be shipped as code
     assert set(ALGOS) >= set(PARTS)
@@ -100,7 +101,7 @@ REFUSED = {
     "lagrange=none": "needs lagrange, got lagrange=none",
     **{
         f"loss={name}": "OffPolicy learns by losses with a qvalue_network"
-        for name in ("cpo", "ppo", "ppo_lag", "ppo_risk")
+        for name in ("cat", "cpo", "crpo", "focops", "p3o", "ppo", "ppo_lag", "ppo_risk")
     },
     "risk=none": "needs risk, got risk=none",
     "loss=sac": "takes no cost_critic",
@@ -196,8 +197,9 @@ def test_arsac_plus_is_arsac_with_another_risk():
     [
         *((algo, {"risk_limit"}) for algo in ("arsac", "arsac_plus", "arsac_signed", "rsac")),
         *((algo, {"cost_limit"}) for algo in ("sac_lag", "sac_pid", "ppo_lag", "cpo")),
+        *((algo, {"cost_limit"}) for algo in ("ppo_pid", "p3o", "focops", "crpo", "ppo_saute")),
         ("arppo", {"cost_limit", "risk_limit"}),
-        *((algo, set()) for algo in ("sac", "sac_rs", "asac", "ppo", "ppo_rs")),
+        *((algo, set()) for algo in ("sac", "sac_rs", "asac", "ppo", "ppo_rs", "cat")),
     ],
 )
 def test_limits_mean_one_thing(algo: str, read: set[str], caplog):

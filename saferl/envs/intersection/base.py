@@ -151,6 +151,7 @@ class Scenario(Task):
     drivers: ClassVar[Mapping[str, Callable[[int], TensorDictModuleBase]]] = DRIVERS
     demonstrators: ClassVar[Sequence[str]] = ("scripted", "blind")
     pictures: ClassVar[bool] = True
+    vector: ClassVar[str] = "ego"
     action_dim: ClassVar[int] = 2
 
     @property
@@ -168,6 +169,10 @@ class Scenario(Task):
     @property
     def network(self) -> Mapping[str, Any]:
         return {"action_dim": self.action_dim, "rows": self.rows, **self.form.scales}
+
+    def widened(self, count: int) -> Mapping[str, Any]:
+        network = self.network
+        return {**network, "ego_scale": (*network["ego_scale"], *[1.0] * count)}
 
     @property
     def title(self) -> str:
