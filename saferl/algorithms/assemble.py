@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any, get_type_hints
 
 import hydra
 import torch
-from omegaconf import DictConfig
-from torchrl.collectors import Collector
+from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import EnvBase, RewardSum, Transform, TransformedEnv
 from torchrl.envs.transforms import Compose
 
 from saferl.algorithms.base import Agent, Algorithm
-from saferl.algorithms.parts import Parts, make
+from saferl.algorithms.parts import Parts, device_of, make
 from saferl.checkpoint.run import begun, latest, load_component, run_config
 from saferl.checkpoint.state import Fitting, Networks
 from saferl.config.check import arguments, check, check_targets, check_task
+from saferl.envs.seeding import U31, mix
 from saferl.envs.task import Task
 from saferl.objectives.values import critic_values
 from saferl.training.best import BestPolicy
+from saferl.training.collector import Seat
+from saferl.training.collectors import Plan
 from saferl.training.experience import check_memory
 from saferl.training.limit import CostWatch
 from saferl.training.progress import Budget
@@ -106,6 +109,29 @@ def build_agent(cfg: DictConfig) -> Agent:
     return algorithm_of(cfg.learning).agent(Parts.of(cfg))
 
 
+def seat(cfg: DictConfig, agent: Agent, num_envs: int, seed: int) -> Seat:
+    """What a process collects with: ``num_envs`` environments, and an agent that acts in them as in training."""
+    algorithm, task = algorithm_of(cfg.learning), make(cfg.task)
+    sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
+    transforms = [sums, *algorithm.transforms(), *agent.transforms]
+    env = build_env(cfg.env, task, num_envs, seed, device_of(cfg.device), transforms)
+    return Seat(env, algorithm.behaviour(agent.actor, env), agent.take)
+
+
+def worker_seat(settings: dict[str, Any], index: int, workers: int) -> Seat:
+    """The seat of a worker, which is built in its process from plain settings, on the CPU.
+
+    Its episodes and its random numbers are those of no other worker and no other seed.
+    """
+    torch.set_num_threads(1)  # a core each
+    cfg = OmegaConf.create(settings | {"device": "cpu"})
+    torch.manual_seed(cfg.seed)
+    agent = build_agent(cfg)  # begins as the learner's
+    seed = int(mix(torch.tensor(cfg.seed), index + 1) & U31)
+    torch.manual_seed(seed)
+    return seat(cfg, agent, cfg.env.num_envs // workers, seed)
+
+
 def load_agent(cfg: DictConfig, path: Path, name: str) -> Agent:
     """The agent of a run or checkpoint as it was; ``name`` is the option that gave it.
 
@@ -167,47 +193,50 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
     torch.set_num_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
     algorithm, parts = algorithm_of(cfg.learning), Parts.of(cfg)
-    num_envs = cfg.env.num_envs
+    num_envs, collecting = cfg.env.num_envs, make(cfg.collector)
     check_task(cfg.evaluation, parts.task)
+    collecting.check(num_envs)
     algorithm.check_collecting(parts.task, num_envs)
     agent = algorithm.agent(parts)
     if cfg.init and not begun(run):  # a run that goes on has its own networks
         begin_from(agent, algorithm.architecture(parts), Path(cfg.init), cfg.device)
-    sums = RewardSum(["reward", "cost"], ["episode_reward", "episode_cost"])
-    transforms: list[Any] = [sums, *algorithm.transforms(), *agent.transforms]
-    make_env = partial(build_env, cfg.env, parts.task, device=parts.device)
-    env = make_env(num_envs, cfg.seed, transforms=transforms)
-    collector = Collector(
-        env,
-        algorithm.behaviour(agent.actor, env),
-        frames_per_batch=algorithm.decisions(num_envs) * num_envs,
-        total_frames=-1,
-        init_random_frames=0 if cfg.init else algorithm.random_frames(),
-        track_traj_ids=False,
-        auto_register_policy_transforms=False,
+    settings: Any = OmegaConf.to_container(cfg, resolve=True)
+    plan = Plan(
+        agent,
+        parts.device,
+        own=partial(seat, cfg, agent, num_envs, cfg.seed),
+        seat=partial(worker_seat, settings),
+        num_envs=num_envs,
+        decisions=algorithm.decisions(num_envs),
+        random_frames=0 if cfg.init else algorithm.random_frames(),
     )
-    learner = algorithm.learner(agent.loss, cfg.compile)
-    experience = algorithm.experience(agent, learner, parts.task, make_env, num_envs, cfg.seed)
-    stored = env.fake_tensordict().select(*agent.stored, strict=False)
-    capacity = experience.buffer.storage.max_size
-    check_memory(algorithm.kept, capacity, stored, torch.device(parts.device))
-    trainer = Trainer(
-        run=run,
-        collector=collector,
-        experience=experience,
-        learner=learner,
-        window=EpisodeWindow(parts.task.outcomes),
-        watch=CostWatch(cfg.cost_limit),
-        watchdog=Watchdog(agent.loss, cfg.gamma, cfg.learning.reward_scale, critic_values),
-        best=BestPolicy(run, agent.loss, cfg),
-        budget=Budget(cfg.episodes, cfg.frames),
-        record_every=cfg.record_every,
-        save_every=cfg.save_every,
-        save_minutes=cfg.save_minutes,
-        open_loggers=partial(build_loggers, cfg.logger.sinks, run),
-    )
-    if cfg.lagrange.signal._target_ is not None:
-        make(cfg.lagrange.signal).register(trainer)
-    if agent.projector is not None and hasattr(agent.projector, "set_progress"):
-        ProjectorProgress(agent.projector).register(trainer)
+    with ExitStack() as unless_built:
+        collector = collecting.collect(plan)
+        unless_built.callback(collector.shutdown)
+        make_env = partial(build_env, cfg.env, parts.task, device=parts.device)
+        learner = algorithm.learner(agent.loss, cfg.compile)
+        experience = algorithm.experience(agent, learner, parts.task, make_env, num_envs, cfg.seed)
+        stored = collector.example().select(*agent.stored, strict=False)
+        capacity = experience.buffer.storage.max_size
+        check_memory(algorithm.kept, capacity, stored, parts.device)
+        trainer = Trainer(
+            run=run,
+            collector=collector,
+            experience=experience,
+            learner=learner,
+            window=EpisodeWindow(parts.task.outcomes),
+            watch=CostWatch(cfg.cost_limit),
+            watchdog=Watchdog(agent.loss, cfg.gamma, cfg.learning.reward_scale, critic_values),
+            best=BestPolicy(run, agent.loss, cfg),
+            budget=Budget(cfg.episodes, cfg.frames),
+            record_every=cfg.record_every,
+            save_every=cfg.save_every,
+            save_minutes=cfg.save_minutes,
+            open_loggers=partial(build_loggers, cfg.logger.sinks, run),
+        )
+        if cfg.lagrange.signal._target_ is not None:
+            make(cfg.lagrange.signal).register(trainer)
+        if agent.projector is not None and hasattr(agent.projector, "set_progress"):
+            ProjectorProgress(agent.projector).register(trainer)
+        unless_built.pop_all()
     return trainer

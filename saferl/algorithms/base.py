@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -11,6 +11,7 @@ import hydra
 import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.envs import EnvBase, Transform
 from torchrl.objectives import LossModule
 
@@ -28,6 +29,9 @@ STORED = (
     *(("next", key) for key in ("reward", "cost", "done", "terminated")),
     ("next", "action_executed"),
 )
+
+#: Networks of a loss that no decision reads, by how their names begin.
+_UNREAD = ("target_", "qvalue_network", "critic_network")
 
 
 @dataclass
@@ -76,6 +80,39 @@ class Agent:
     def stored(self) -> tuple[Any, ...]:
         """Keys of a transition that are kept: what the networks read of a state and of the next, and :data:`STORED`."""
         return (*self.observed, *(("next", key) for key in self.observed), *STORED)
+
+    def switches(self) -> dict[str, Tensor]:
+        """What the transforms are told in training (whether a projector acts yet), by name."""
+        return {
+            f"transform{index}.{name}": torch.as_tensor(value)
+            for index, transform in enumerate(self.transforms)
+            for name, value in transform.state_dict().items()
+        }
+
+    def learned(self) -> dict[str, Tensor]:
+        """All that decides what is executed, by name: live tensors of the loss, without its targets and values of rewards,
+        and :meth:`switches`."""
+        return self._read() | self.switches()
+
+    def _read(self) -> dict[str, Tensor]:
+        return {
+            name: value
+            for name, value in self.loss.state_dict().items()
+            if isinstance(value, Tensor) and not name.startswith(_UNREAD)
+        }
+
+    @torch.no_grad()
+    def take(self, learned: Mapping[str, Tensor]) -> None:
+        """Decide as another agent of this composition would, of which this is :meth:`learned`; what it lacks stays."""
+        for name, value in self._read().items():
+            if name in learned:
+                value.copy_(learned[name])
+        for index, transform in enumerate(self.transforms):
+            own = transform.state_dict()
+            told = {name: learned[f"transform{index}.{name}"] for name in own}
+            transform.load_state_dict(
+                {k: v if isinstance(own[k], Tensor) else v.item() for k, v in told.items()}
+            )
 
 
 def chain(projector: DictConfig) -> list[DictConfig]:

@@ -1,7 +1,6 @@
 """What a checkpoint of a run holds: components with ``state_dict`` and ``load_state_dict``.
 
-TorchRL knows modules and optimizers; these are the parts that it does not: the collector in
-mid-episode, the buffer as plain tensors, files that grow while a run lasts, and modules that say
+TorchRL knows modules and optimizers; these are the parts that it does not: the buffer as plain tensors, files that grow while a run lasts, and modules that say
 what does not fit.
 """
 
@@ -14,56 +13,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torch import Tensor
-from torchrl.collectors import Collector
 from torchrl.data import ReplayBuffer
-from torchrl.envs import EnvBase, TransformedEnv
-
-
-class CollectorState:
-    """A collector in mid-episode: its environments' state, its last observation, its counters.
-
-    TorchRL's ``Collector.state_dict`` holds neither the base environment nor the observation that the
-    next action answers, so a run restored from it alone starts new episodes.
-
-    Args:
-        collector: in this process, on an environment with ``state_dict`` and ``load_state_dict``.
-    """
-
-    def __init__(self, collector: Collector):
-        self.collector = collector
-
-    @property
-    def _base_env(self) -> EnvBase:
-        env = self.collector.env
-        return env.base_env if isinstance(env, TransformedEnv) else env
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that the next collected frame depends on, but for the global generators."""
-        state = {
-            "env": self._base_env.state_dict(),
-            "carrier": self.collector._carrier.to_dict(retain_none=False),
-            "frames": self.collector._frames,
-            "iter": self.collector._iter,
-        }
-        if isinstance(self.collector.env, TransformedEnv):
-            state["transform"] = self.collector.env.transform.state_dict()
-        return state
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue exactly where :meth:`state_dict` was taken."""
-        collector = self.collector
-        self._base_env.load_state_dict(state["env"])
-        if "transform" in state:
-            collector.env.transform.load_state_dict(state["transform"])  # pyright: ignore
-        built = collector._carrier
-        carrier = TensorDict.from_dict(
-            state["carrier"], batch_size=collector.env.batch_size, device=collector.env.device
-        )
-        # Laid out as the environment lays it out: a product of matrices may round otherwise.
-        for key in set(carrier.keys(True, True)) & set(built.keys(True, True)):
-            carrier[key] = torch.empty_like(built[key]).copy_(carrier[key])
-        collector._carrier = carrier
-        collector._frames, collector._iter = state["frames"], state["iter"]
 
 
 class BufferState:

@@ -15,13 +15,14 @@ from saferl.algorithms.assemble import build_trainer, complete
 from saferl.algorithms.parts import make
 from saferl.algorithms.policy import compiling
 from saferl.checkpoint.lock import alone
-from saferl.checkpoint.run import CONFIG, begun, run_config, run_folder
+from saferl.checkpoint.run import CONFIG, begun, progress, run_config, run_folder
 from saferl.cli.evaluate import Candidate, drawn, measure, pictures
 from saferl.cli.launch import job_folder
 from saferl.config.flat import MADE
 from saferl.config.limits import check_limits
 from saferl.evaluation.compare import TESTED, side_by_side
 from saferl.evaluation.statistics import FIGURES, summarise
+from saferl.training.crew import WorkerLost
 
 log = logging.getLogger(__name__)
 
@@ -53,18 +54,7 @@ def train(cfg: DictConfig) -> None:
             if path.is_symlink():  # to write there would be to write elsewhere
                 raise ValueError(f"{path} is a link, which no run has.")
         try:
-            with closing(build_trainer(cfg, run)) as trainer:
-                if resuming:
-                    trainer.resume()
-                    if cfg != run_config(run):  # a larger budget, of which no test is there yet
-                        (run / TESTED).unlink(missing_ok=True)
-                        part = run / f"{CONFIG}.part"
-                        OmegaConf.save(cfg, part)
-                        part.replace(run / CONFIG)
-                log.info(
-                    "%s on %s, seed %d. Files: %s", cfg.algo_name, cfg.task.task, cfg.seed, run
-                )
-                trainer.train()
+            learn(cfg, run, resuming)
         finally:
             if not resuming and not begun(run):  # it never began
                 (run / CONFIG).unlink(missing_ok=True)
@@ -76,6 +66,40 @@ def train(cfg: DictConfig) -> None:
             raise KeyboardInterrupt(
                 f"Interrupted in the closing test. Repeat it with resume={run}"
             ) from None
+
+
+def learn(cfg: DictConfig, run: Path, resuming: bool) -> None:
+    """Train to the end of the budget; where a worker is killed, go on from the newest checkpoint with new ones, which ends in
+    the same bits.
+
+    Raises:
+        WorkerLost: it was not killed, or one was killed after the same checkpoint before.
+    """
+    lost_at = -1
+    while True:
+        try:
+            return _learn(cfg, run, resuming)
+        except WorkerLost as lost:
+            resuming = begun(run)
+            saved = progress(run)["frames"] if resuming else -1
+            if not lost.killed or saved == lost_at:
+                way = f" Continue with resume={run}" if resuming else ""
+                raise WorkerLost(f"{lost}{way}", lost.killed) from lost
+            log.warning("%s The run goes on from its checkpoint of frame %d.", lost, saved)
+            lost_at = saved
+
+
+def _learn(cfg: DictConfig, run: Path, resuming: bool) -> None:
+    with closing(build_trainer(cfg, run)) as trainer:
+        if resuming:
+            trainer.resume()
+            if cfg != run_config(run):  # a larger budget, of which no test is there yet
+                (run / TESTED).unlink(missing_ok=True)
+                part = run / f"{CONFIG}.part"
+                OmegaConf.save(cfg, part)
+                part.replace(run / CONFIG)
+        log.info("%s on %s, seed %d. Files: %s", cfg.algo_name, cfg.task.task, cfg.seed, run)
+        trainer.train()
 
 
 def closing_test(cfg: DictConfig, run: Path) -> None:

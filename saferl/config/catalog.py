@@ -12,7 +12,7 @@ from saferl.config.locate import config_dir
 #: Groups in the order in which a user meets them.
 GROUPS = (
     *("algo", "task", "env", "encoder", "loss", "critic", "cost_critic", "risk", "lagrange"),
-    *("projector", "transform", "shaping", "learning", "logger", "experiment"),
+    *("projector", "transform", "shaping", "learning", "collector", "logger", "experiment"),
 )
 
 

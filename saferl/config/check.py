@@ -31,6 +31,7 @@ PARTS = {
     "lagrange.signal": "saferl.training.signals.Signal",
     "projector": "torchrl.envs.Transform",
     "transform": "saferl.envs.transforms.Saute",
+    "collector": "saferl.training.collectors.Collecting",
     "logger.sinks": "torchrl.record.loggers.Logger",
 }
 

@@ -14,7 +14,7 @@ import hydra
 
 #: Classes that a file may name.
 _PARTS = re.compile(
-    r"(?:saferl\.(?:algorithms|modules|objectives|envs|envs\.transforms|envs\.intersection|training\.signals)"
+    r"(?:saferl\.(?:algorithms|modules|objectives|envs|envs\.transforms|envs\.intersection|training\.(?:signals|collectors))"
     r"|torchrl\.(?:objectives|modules|record\.loggers)|torch\.nn)\.[A-Z]\w*"
 )
 #: By which a file names a class or a function, its ``path``.

@@ -228,6 +228,7 @@ class Training:
     lagrange: Lagrange = field(default_factory=Lagrange)
     projector: dict[str, Any] = field(default_factory=dict)
     transform: dict[str, Any] = field(default_factory=dict)
+    collector: dict[str, Any] = field(default_factory=dict)
     logger: Logger = field(default_factory=Logger)
     seed: int = MISSING
     device: str = MISSING

@@ -29,7 +29,7 @@ FINISHED, RUNNING, INTERRUPTED, BROKEN, FOREIGN = STATES = (
 CURVE, TIMING, FAILED = "metrics.csv", "timing.csv", "error.txt"
 _ROAD = "saferl.envs.intersection.Scenario"
 #: What may differ between repetitions: it changes where, how fast or how often something is done, and no result.
-_FREE = (*REPETITION, *MADE, "record_every")
+_FREE = (*REPETITION, *MADE, "record_every", "collector")
 #: What systems that are compared have in common: the task, but for a reward of their own in training, and the test.
 _COMMON = ("task", "evaluation.episodes")
 #: And those of a family, off-policy or on-policy: an update of one is dearer than of the other.

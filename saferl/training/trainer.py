@@ -15,14 +15,15 @@ from typing import Any, Protocol
 
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.collectors import Collector
 from torchrl.data import ReplayBuffer
 from torchrl.record.loggers import Logger
 
 from saferl.checkpoint.run import RunCheckpoint
-from saferl.checkpoint.state import CollectorState, Fitting, GrowingFiles
+from saferl.checkpoint.state import Fitting, GrowingFiles
 from saferl.evaluation.progress import bar
 from saferl.training.best import BestPolicy
+from saferl.training.collector import WholeCollector
+from saferl.training.crew import Crew
 from saferl.training.learner import Learner
 from saferl.training.limit import CostWatch
 from saferl.training.progress import Budget, Clock, Progress
@@ -84,7 +85,7 @@ class Trainer:
 
     Attributes:
         run: folder of the run's files.
-        collector: yields [B, T] batches of transitions.
+        collector: yields [B, T] batches of transitions; its state is whole.
         experience: takes each batch, and gives what the learner updates from.
         learner: makes one update from what it is given.
         budget: how long.
@@ -102,7 +103,7 @@ class Trainer:
     """
 
     run: Path
-    collector: Collector
+    collector: WholeCollector | Crew
     experience: Experience
     learner: Learner
     budget: Budget
@@ -137,7 +138,7 @@ class Trainer:
             loss=Fitting(self.learner.loss),
             optimizer=self.learner.optimizer,
             buffer=self.experience,
-            collector=CollectorState(self.collector),
+            collector=self.collector,
             progress=self.progress,
             clock=self.clock,
             window=self.window,
@@ -157,7 +158,7 @@ class Trainer:
         log.info("Resumed %s at frame %d.", path, self.progress.frames)
 
     def close(self) -> None:
-        """Close the environments: a simulator may be one of which a process holds only one."""
+        """Close the environments and end the workers: a simulator may be one of which a process holds only one."""
         self.collector.shutdown()
 
     @property
