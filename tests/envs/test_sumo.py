@@ -240,6 +240,20 @@ def test_cars_stop_for_an_ego_that_stands_in_the_box(make):
     assert early and hits.sum() <= 1
 
 
+@there
+def test_an_ego_that_stands_far_before_the_box_holds_nobody_up(make):
+    """An oncoming car that turns left would wait for it, if it were taken for somebody who is about to go."""
+    env = make(8, task="gs", policy_frequency=5)
+    reset(env, episode_seeds(1, 8))
+    env._state["ego"] = env._state["ego"] * torch.tensor([1.0, 1.0, 0.0, 0.0, 1.0, 0.0])
+    for _ in range(110):
+        view = step(env, (-1.0, 0.0))
+    _, vehicles = env.scene()
+    lane = lanes(vehicles.route, vehicles.s)
+    before_the_box = vehicles.present & (vehicles.s < ARM) & (lane.approach >= 2)  # not behind it
+    assert not before_the_box.any() and not view["collision"].any()
+
+
 # --- episodes ------------------------------------------------------------------------------------
 
 

@@ -27,6 +27,9 @@ from saferl.envs.intersection.roads import (
 _END = HALF_BOX + ARM
 _FAST = 50.0  # m/s, limit of the arms: every car keeps to the speed that it wants
 _POINTS = 33  # of a bend
+#: m/s^2 that others expect of the ego: they take it for going on as it does, as our rules do, and one that stands for
+#: standing; with SUMO's 2.6 an oncoming car waits for ever for one that stands far before the box.
+_STEADY = 0.01
 #: By how many arms a movement goes on, clockwise.
 _ARMS_ON = {"left": 1, "straight": 2, "right": 3}
 
@@ -123,7 +126,7 @@ def cars(manners: Manners) -> str:
         _tag("vType", id="obedient", probability=1 - share, **usual),
         _tag("vType", id="heedless", probability=share, **usual, **_HEEDLESS),
         _tag("vTypeDistribution", id="car", vTypes="obedient heedless"),
-        _tag("vType", id="ego", maxSpeed=SPEED_LIMIT, **size),
+        _tag("vType", id="ego", maxSpeed=SPEED_LIMIT, accel=_STEADY, **size),
     ]
     for route in range(4 * len(PRIORITIES)):
         lines.append(_tag("route", id=route, edges=" ".join(edges_of(route))))
