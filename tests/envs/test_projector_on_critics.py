@@ -95,7 +95,7 @@ def test_compiled_in_parts(monkeypatch, backend, batch):
     limit = ensemble(states.copy())["risk"].mean().item() - (batch == 1)
     forms = [SafetyProjector(ensemble, limit, penalty=10.0, compile=c) for c in (False, True)]
     envs = [TransformedEnv(EchoEnv(), form) for form in forms]
-    plain, compiled = (form._inv_call(states.copy())["_safety_projection"] for form in forms)
+    plain, compiled = (form._inv_call(states.copy())["_correction"] for form in forms)
     changed = int(plain["intervened"].sum())
     assert changed == 1 if batch == 1 else batch / 4 < changed < batch
     for key, value in plain.items():
