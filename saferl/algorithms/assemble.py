@@ -19,6 +19,7 @@ from saferl.algorithms.parts import Parts, device_of, make
 from saferl.checkpoint.run import begun, latest, load_component, run_config
 from saferl.checkpoint.state import Fitting, Networks
 from saferl.config.check import arguments, check, check_targets, check_task
+from saferl.config.limits import order_limits
 from saferl.envs.seeding import U31, mix
 from saferl.envs.task import Task
 from saferl.objectives.values import critic_values
@@ -26,7 +27,7 @@ from saferl.training.best import BestPolicy
 from saferl.training.collector import Seat
 from saferl.training.collectors import Plan
 from saferl.training.experience import check_memory
-from saferl.training.limit import CostWatch
+from saferl.training.limit import watch_of
 from saferl.training.progress import Budget
 from saferl.training.records import EpisodeWindow
 from saferl.training.signals import ProjectorProgress
@@ -65,8 +66,8 @@ def build_env(
     return TransformedEnv(env, Compose(*transforms)) if transforms else env  # pyright: ignore
 
 
-def complete(node: DictConfig) -> None:
-    """Write into a node of the group ``task`` what the task takes from the environment itself.
+def complete(node: DictConfig) -> Task:
+    """Write into a node of the group ``task`` what the task takes from the environment itself; returns the task.
 
     Raises:
         ValueError: the task's settings cannot be meant.
@@ -77,6 +78,7 @@ def complete(node: DictConfig) -> None:
         )
     check_targets(node, "task")
     node.merge_with(make(node).complete())
+    return make(node)
 
 
 def build_loggers(sinks: Sequence[DictConfig], run: Path) -> list:
@@ -188,7 +190,8 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         ValueError: something in the configuration cannot be meant; names the key.
         FileNotFoundError: ``init`` names no checkpoint.
     """
-    complete(cfg.task)
+    costs = complete(cfg.task).costs
+    order_limits(cfg, costs)
     check(cfg)
     torch.set_num_threads(cfg.threads)
     torch.manual_seed(cfg.seed)
@@ -224,10 +227,11 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
             collector=collector,
             experience=experience,
             learner=learner,
-            window=EpisodeWindow(parts.task.outcomes),
-            watch=CostWatch(cfg.cost_limit),
+            window=EpisodeWindow(parts.task.outcomes, costs=costs),
+            watch=watch_of(cfg.cost_limit, costs),
+            costs=costs,
             watchdog=Watchdog(agent.loss, cfg.gamma, cfg.learning.reward_scale, critic_values),
-            best=BestPolicy(run, agent.loss, cfg),
+            best=BestPolicy(run, agent.loss, cfg, costs),
             budget=Budget(cfg.episodes, cfg.frames),
             record_every=cfg.record_every,
             save_every=cfg.save_every,

@@ -256,7 +256,7 @@ class Algorithm(ABC):
             **self.loss_parts(networks),
             "num_qvalue_nets": lambda: parts.critic.members,
             "num_cost_critics": lambda: parts.cost_critic.members,
-            "lagrange": lambda: make(parts.lagrange.multiplier),
+            "lagrange": lambda: make(parts.lagrange.multiplier).expand(len(parts.task.costs)),
         }
         built = {name: part() for name, part in settings.items() if name in accepted}
         loss = make(parts.loss, **built).to(parts.device)
@@ -291,7 +291,7 @@ class Algorithm(ABC):
         """What decides whether the networks of two compositions fit, by option."""
         options: dict[str, Any] = {
             f"task.{key}": getattr(parts.task, key, None)
-            for key in ("rows", "size", "action_dim", "observation")
+            for key in ("rows", "size", "action_dim", "observation", "costs")
         }
         # Of the critics those of action values: state values have no options.
         critics = {"critic": "qvalue_network", "cost_critic": self.risks}

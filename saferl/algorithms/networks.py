@@ -63,6 +63,7 @@ class NetworkBuilder:
         critics: DictConfig,
         out_key: str,
         prepare: Callable[[Any], Any] = lambda network: network,
+        costs: int = 1,
     ) -> Any:
         """As many values of an action as a group of critics has members: one, or a list.
 
@@ -70,9 +71,12 @@ class NetworkBuilder:
             critics: the group.
             out_key: where each writes.
             prepare: what is done with each first.
+            costs: of how many costs each is a value.
         """
         # Only what differs, so that an encoder need not know of options that it is not asked for.
-        options = {k: v for k, v in critic_options(critics).items() if v != USUAL[k]}
+        options = critic_options(critics)
+        options["outputs"] *= costs
+        options = {k: v for k, v in options.items() if v != USUAL[k]}
         networks = [
             self.encoder.value(**options).to(self.parts.device) for _ in range(critics.members)
         ]
@@ -87,7 +91,8 @@ class NetworkBuilder:
 
     def risk_critics(self) -> Any:
         """Q_c(s, a), at 0, or a projector would correct every action before the first cost was seen."""
-        return self.action_values(self.parts.cost_critic, "state_action_cost_value", zero_output)
+        critics, costs = self.parts.cost_critic, len(self.parts.task.costs)
+        return self.action_values(critics, "state_action_cost_value", zero_output, costs)
 
 
 def critic_options(critics: DictConfig) -> dict[str, Any]:

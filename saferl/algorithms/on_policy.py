@@ -56,14 +56,16 @@ class OnPolicy(OnPolicyLearning, Algorithm):
             refuse_options(name, critics, f"is of action values, which {loss} has not")
 
     def loss_parts(self, networks: NetworkBuilder) -> dict[str, Callable[[], Any]]:
-        def state_value(out_key: str) -> torch.nn.Module:
+        def state_value(out_key: str, outputs: int = 1) -> torch.nn.Module:
             features = networks.encoder.policy()
-            network = StateValue(features, networks.encoder.width).to(networks.parts.device)
+            network = StateValue(features, networks.encoder.width, outputs)
+            network = network.to(networks.parts.device)
             return value_operator(network, in_keys=networks.reads(features), out_key=out_key)
 
+        costs = len(networks.parts.task.costs)
         return {
             "critic_network": lambda: state_value("state_value"),
-            "cost_critic": lambda: state_value("state_cost_value"),
+            "cost_critic": lambda: state_value("state_cost_value", costs),
             "risk_critic": networks.risk_critics,
         }
 

@@ -19,6 +19,7 @@ _PLAIN = re.compile(
     r"(?!(?:true|false|nan|inf)$)(?:(?:[a-z_/]|\.(?!\d))[\w./-]*)?|(['\"]).*\1",
     re.ASCII | re.IGNORECASE,
 )
+_NAMED = re.compile(r"^(cost|risk)_limit\.")
 #: Functions by which a sweep may list paths.
 _LISTING = re.compile(r"(?:choice|glob|shuffle|sort)\(.*\)")
 
@@ -29,6 +30,7 @@ def readable(arguments: Sequence[str]) -> list[str]:
     - Flags may stand anywhere.
     - A path may hold any character: ``resume=run (1)``, ``out=algo=sac,seed=0``. Only ``${...}`` is looked up, and with ``-m`` a
       comma parts two paths, unless there is a file of that name.
+    - A limit on one of several costs is set by its name: ``cost_limit.speed=0.1``.
     - A job of ``-m`` is named by the settings in which the jobs differ.
 
     >>> readable(["-m", "seed=0", "algo=sac,asac", "out=my run"])
@@ -45,7 +47,8 @@ def readable(arguments: Sequence[str]) -> list[str]:
         else:
             settings.append(argument)
     many = any(flag in ("-m", "--multirun") for flag in flags)
-    settings = [_quoted(setting, many) for setting in settings]
+    # In place of a number for one cost, which has no names to override.
+    settings = [_NAMED.sub(r"+\g<0>", _quoted(setting, many)) for setting in settings]
     return [*settings, *(_names(settings) if many else []), *flags]
 
 

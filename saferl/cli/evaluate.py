@@ -63,7 +63,7 @@ class Candidate:
     transforms: Sequence[Transform] = ()
     projects: bool = False
     critics: TensorDictModuleBase | None = None
-    limit: float | None = None
+    limit: float | Sequence[float] | None = None
     about: Mapping[str, Any] = field(default_factory=dict)
     origin: Mapping[str, Any] = field(default_factory=dict)
 
@@ -79,7 +79,8 @@ class Candidate:
         """
         agent = trained_agent(cfg, path)
         projects = project and agent.projector is not None
-        about = {"cost_limit": cfg.cost_limit}
+        settings: Any = OmegaConf.to_container(cfg)
+        about = {"cost_limit": settings["cost_limit"]}
         origin = {"algo": cfg.algo_name, "training_seed": cfg.seed}
         if not project and agent.projector is not None:
             origin["algo"] += " unprojected"
@@ -302,6 +303,8 @@ def choose_policy(
             )
     called = f"{trained.algo_name} ({name})"
     who = Candidate.trained(called, compiling(trained, cfg.compile), path, cfg.project)
+    if tuple(task.costs) != tuple(learned.costs):  # its limits are on others
+        who = replace(who, about={})
     return cfg, task, who.behind(cfg.projector)
 
 

@@ -32,8 +32,8 @@ def train(cfg: DictConfig) -> None:
     resuming = cfg.resume is not None
     if not resuming:
         run = Path(HydraConfig.get().runtime.output_dir)
-        complete(cfg.task)
-        check_limits(cfg, HydraConfig.get().overrides.task)
+        costs = complete(cfg.task).costs
+        check_limits(cfg, HydraConfig.get().overrides.task, costs)
         OmegaConf.resolve(cfg)
         if job_folder() and (run / CONFIG).exists():
             if begun(run):  # a sweep that is run again

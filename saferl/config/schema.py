@@ -28,6 +28,22 @@ def at_least(least: float, settings: Any, *names: str, prefix: str = "") -> None
             raise ValueError(f"{prefix}{name} must be >= {least}, got {value}.")
 
 
+def limits(settings: Any, *names: str) -> None:
+    """Refuse limits that are neither a finite number >= 0 nor several of them, in a list or by name; None passes."""
+    for name in names:
+        given = getattr(settings, name)
+        each = {} if given is None else {name: given}
+        if isinstance(given, dict):
+            each = {f"{name}.{key}": value for key, value in given.items()}
+        elif isinstance(given, list):
+            each = {f"{name}[{index}]": value for index, value in enumerate(given)}
+        for key, value in each.items():
+            if isinstance(value, bool) or not isinstance(value, (int, float)):
+                raise ValueError(f"{key} must be a number, got {value!r}.")
+            if not 0 <= value < math.inf:
+                raise ValueError(f"{key} must be >= 0, got {value}.")
+
+
 def above(least: float, settings: Any, *names: str, prefix: str = "") -> None:
     """Refuse settings of ``least`` and below, and those that are not finite; None passes."""
     for name in names:
@@ -237,8 +253,8 @@ class Training:
     episodes: int | None = MISSING
     frames: int | None = MISSING
     gamma: float = MISSING
-    cost_limit: float | None = MISSING
-    risk_limit: float | None = MISSING
+    cost_limit: Any = MISSING  # a number, or of several costs a list, or a mapping by their names
+    risk_limit: Any = MISSING
     record_every: int = MISSING
     save_every: int = MISSING
     save_minutes: float | None = MISSING
@@ -252,7 +268,7 @@ class Training:
         at_least(0, self.cost_critic, "members", prefix="cost_critic.")
         at_least(1, self.cost_critic, "outputs", prefix="cost_critic.")
         seeded(self)
-        at_least(0, self, "cost_limit", "risk_limit")
+        limits(self, "cost_limit", "risk_limit")
         at_least(1, self, "threads", "episodes", "frames", "record_every", "save_every")
         above(0, self, "save_minutes")
         share(self, "gamma")

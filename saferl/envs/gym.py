@@ -7,7 +7,7 @@ from __future__ import annotations
 import importlib
 import sysconfig
 import traceback
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
@@ -34,6 +34,8 @@ class GymTask(Task):
         cost_key: the entry of ``info`` that is the cost; None: every cost is 0. A step that returns six
             values (observation, reward, cost, terminated, truncated, info), as Safety-Gymnasium's, says its
             cost itself.
+        costs: of several costs the entries of ``info``, in place of ``cost_key``; a step of six values tells K numbers in
+            this order. None: there is one cost.
         kwargs: of the environment.
         size, action_dim: numbers of an observation and of an action: the environment's own.
         horizon: decisions of an episode at most, in place of the environment's own limit; None: that one.
@@ -47,6 +49,7 @@ class GymTask(Task):
 
     id: str
     cost_key: str | None = "cost"
+    costs: tuple[str, ...] | None = None
     kwargs: dict[str, Any] | None = None
     size: int | None = None
     action_dim: int | None = None
@@ -56,6 +59,10 @@ class GymTask(Task):
     task: str = "gym"
 
     def __post_init__(self):
+        costs = (self.cost_key or "cost",) if self.costs is None else tuple(self.costs)
+        object.__setattr__(self, "costs", costs)
+        if not 0 < len(set(costs)) == len(costs):
+            raise ValueError(f"task.costs must be null or different names, got {list(costs)}.")
         for name in ("seeds", "test_seeds"):
             numbers = getattr(self, name)
             if numbers is not None:
@@ -115,7 +122,7 @@ class GymTask(Task):
         Raises:
             ValueError: what is not open differs from it; or a step tells no cost, or no finite number.
         """
-        env = _Cost(self.make(), self.cost_key)
+        env = _Cost(self.make(), self)
         limit = gymnasium.spec(self.id.rpartition(":")[2]).max_episode_steps
         horizon = limit if self.horizon is None else self.horizon
         if horizon is None:
@@ -146,10 +153,10 @@ class GymEnvs(ReplayedEnv):
         device: of the tensors.
 
     Reads ``action`` [B, A] in [-1, 1], rescaled to the environment's box. Writes ``observation`` [B, size], flat, pixels in [0, 1],
-    and ``reward`` and ``cost`` [B, 1].
+    ``reward`` [B, 1] and ``cost`` [B, K].
 
     Raises:
-        ValueError: as :meth:`GymTask.make`; or, in an episode, no ``cost_key`` in ``info``, or an observation,
+        ValueError: as :meth:`GymTask.make`; or, in an episode, a cost that ``info`` has not, or an observation,
             reward or cost that is no finite number.
 
     >>> env = GymEnvs(GymTask("Pendulum-v1", cost_key=None), num_envs=2)
@@ -179,7 +186,7 @@ class GymEnvs(ReplayedEnv):
     def _make(self) -> gymnasium.Env:
         env = self.task.make()
         ones = np.ones(env.action_space.shape, np.float32)  # pyright: ignore
-        env = _Cost(env, self.task.cost_key)
+        env = _Cost(env, self.task)
         return FlattenObservation(RescaleAction(env, -ones, ones))
 
     def _stack(self, ended: bool) -> TensorDict:
@@ -214,7 +221,7 @@ class GymEnvs(ReplayedEnv):
         truncated = truncated or len(self._actions[index]) >= self.horizon
         ends = {"terminated": terminated, "truncated": truncated, "done": terminated or truncated}
         observation = observation / self._unit
-        numbers = self._numbers(observation=observation, reward=[reward], cost=[info[_COST]])
+        numbers = self._numbers(observation=observation, reward=[reward], cost=info[_COST])
         return {**numbers, **{key: np.array([end], bool) for key, end in ends.items()}}
 
     def close(self, **kwargs) -> None:
@@ -257,26 +264,33 @@ _COST = "saferl_cost"
 
 
 class _Cost(gymnasium.Wrapper):
-    """Brings the cost of a step to one place in ``info``, wherever the environment says it."""
+    """Brings the costs of a step to one place in ``info``, wherever the environment says them."""
 
-    def __init__(self, env: gymnasium.Env, key: str | None):
+    def __init__(self, env: gymnasium.Env, task: GymTask):
         super().__init__(env)
-        self.key = key
+        self.names: Sequence[str] = task.costs  # pyright: ignore[reportAttributeAccessIssue]
+        self.free = task.cost_key is None
+        self.setting = "task.cost_key" if self.names == (task.cost_key,) else "task.costs"
+
+    def _numbers(self, value: Any, count: int) -> list[float]:
+        numbers = np.asarray(value)
+        if numbers.size != count or numbers.dtype.kind not in "biuf":
+            must = "a cost must be one number" if count == 1 else f"costs must be {count} numbers"
+            raise ValueError(f"{self.setting}: {must}, got {value!r}.")
+        return [float(number) for number in numbers.reshape(-1)]
+
+    def _told(self, info: dict[str, Any]) -> list[float]:
+        if self.free:
+            return [0.0] * len(self.names)
+        for name in self.names:
+            if name not in info:
+                raise ValueError(
+                    f"{self.setting}: info has no {name!r}, it has {sorted(info)}; "
+                    "task.cost_key=null makes every cost 0."
+                )
+        return [number for name in self.names for number in self._numbers(info[name], 1)]
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        observation, reward, *cost, terminated, truncated, info = self.env.step(action)
-        if cost:
-            (value,) = cost
-        elif self.key is None:
-            value = 0.0
-        elif self.key in info:
-            value = info[self.key]
-        else:
-            raise ValueError(
-                f"task.cost_key: info has no {self.key!r}, it has {sorted(info)}; "
-                "null makes every cost 0."
-            )
-        number = np.asarray(value)
-        if number.size != 1 or number.dtype.kind not in "biuf":
-            raise ValueError(f"task.cost_key: a cost must be one number, got {value!r}.")
-        return observation, reward, terminated, truncated, {**info, _COST: float(number.item())}
+        observation, reward, *own, terminated, truncated, info = self.env.step(action)
+        costs = self._numbers(own[0], len(self.names)) if own else self._told(info)
+        return observation, reward, terminated, truncated, {**info, _COST: costs}

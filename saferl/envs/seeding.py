@@ -47,7 +47,8 @@ def episode_seeds(seed: int, count: int) -> Tensor:
 
 
 class SeededEnv(EnvBase):
-    """A batch of environments, each with its own sequence of seeded episodes; ``reward`` and ``cost`` [B, 1].
+    """A batch of environments, each with its own sequence of seeded episodes; ``reward`` [B, 1] and ``cost`` [B, K], a
+    number for each of the task's costs.
 
     ``env.reset(seeds=...)`` plays the episodes of these seeds, B integers, with or without transforms around the
     environment; the sequences stand still. Without them every environment goes on in its own sequence, which follows
@@ -85,7 +86,8 @@ class SeededEnv(EnvBase):
         batch = self.batch_size
         flag = Binary(n=1, shape=(*batch, 1), dtype=torch.bool)  # pyright: ignore
         scalar = Unbounded(shape=(*batch, 1))  # pyright: ignore[reportArgumentType]
-        self.reward_spec = Composite(reward=scalar.clone(), cost=scalar.clone(), shape=batch)
+        cost = Unbounded(shape=(*batch, len(self.task.costs)))  # pyright: ignore
+        self.reward_spec = Composite(reward=scalar, cost=cost, shape=batch)
         self.full_done_spec = Composite(
             done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=batch
         )

@@ -23,6 +23,7 @@ class Task:
     Attributes:
         task: what runs are called.
         size, action_dim: numbers of an observation and of an action.
+        costs: names of the K numbers that ``cost`` [*B, K] holds.
         horizon: decisions of an episode at most; None where :meth:`complete` tells.
         drivers: scripted policies by name, each made from a seed.
         demonstrators: names of the drivers whose transitions a replay buffer may begin with.
@@ -35,6 +36,7 @@ class Task:
     size: Any
     action_dim: Any
     horizon: Any
+    costs: Sequence[str] = ("cost",)
     drivers: ClassVar[Mapping[str, Callable[[int], TensorDictModuleBase]]] = {}
     demonstrators: ClassVar[Sequence[str]] = ()
     in_tests: ClassVar[Mapping[str, Any]] = {}

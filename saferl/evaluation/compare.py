@@ -130,9 +130,9 @@ def conditions_side_by_side(tests: Sequence[Mapping]) -> str:
         rates with intervals as in :func:`side_by_side`, or return and cost where there are none. What one test
         repeats of another (a policy has no projector to leave out) counts once.
     """
-    from saferl.evaluation.statistics import FIGURES
+    from saferl.evaluation.statistics import is_figure
 
-    settings = [flat({k: v for k, v in test.items() if k not in FIGURES}) for test in tests]
+    settings = [flat({k: v for k, v in test.items() if not is_figure(k)}) for test in tests]
 
     def told(keys: Sequence[str]) -> list[tuple[str, ...]]:
         return [tuple(str(each.get(key, "-")) for key in keys) for each in settings]
@@ -160,13 +160,12 @@ def conditions_side_by_side(tests: Sequence[Mapping]) -> str:
 def _laid_out(
     heads: Sequence[str], rows: Mapping[tuple[str, ...], Sequence[Mapping]], columns: Sequence[str]
 ) -> str:
-    """A table of labels and, of the tests of each, the figures that some test has."""
-    from saferl.evaluation.statistics import FIGURES
+    """A table of labels and, of the tests of each, the figures that some test has, that of costs for each cost."""
+    from saferl.evaluation.statistics import each_cost, short
 
-    columns = [
-        name for name in columns if any(name in test for some in rows.values() for test in some)
-    ]
-    lines = [(*heads, *(FIGURES[name][0] + " %" * name.endswith("_rate") for name in columns))]
+    there = dict.fromkeys(name for some in rows.values() for test in some for name in test)
+    columns = [name for figure in columns for name in each_cost(figure, there)]
+    lines = [(*heads, *(short(name) + " %" * name.endswith("_rate") for name in columns))]
     for label, tests in rows.items():
         cells = (cell([test for test in tests if name in test], name) for name in columns)
         lines.append((*label, *cells))

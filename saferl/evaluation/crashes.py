@@ -55,6 +55,7 @@ def explain(trace: Trace, scenario: Scenario) -> list[dict[str, Any]]:
         cautious driver who sees all cars, would have come without a crash for 10 s, in the batched simulator. None where there is
         none. A replay that does not end in the same decision by itself, as of an episode with SUMO's drivers, has neither.
     """
+    trace = trace.worst()
     dt, limit = trace.about["dt"], trace.about.get("risk_limit")
     kinds = trace.episodes["outcome"]
     crashes = [i for i, kind in enumerate(kinds) if kind in ("hit_vehicle", "left_road")]

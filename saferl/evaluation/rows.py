@@ -14,13 +14,15 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from saferl.envs.task import Task
+from saferl.evaluation.costs import columns
 from saferl.evaluation.statistics import summarise
 
 
 def episode_rows(steps: list[TensorDictBase], seeds: Tensor, task: Task) -> list[dict]:
     """Figures of each episode of :func:`saferl.evaluation.play.play`: one dict an episode, in the order of ``seeds``.
 
-    Beside those of the task stand ``return``, ``cost_return`` and ``decisions``; where a projector was there, also
+    Beside those of the task stand ``return``, ``cost_return`` (of several costs one for each,
+    :func:`saferl.evaluation.costs.names`) and ``decisions``; where a projector was there, also
     ``intervention_rate``, the share of decisions that it changed, and ``correction``, the mean size of such a change.
     """
     after = steps[0]["next"]
@@ -29,7 +31,8 @@ def episode_rows(steps: list[TensorDictBase], seeds: Tensor, task: Task) -> list
         return torch.stack([step["next", key].double().squeeze(-1) for step in steps]).cpu()
 
     counts = torch.stack([step["alive"] for step in steps]).sum(0).tolist()
-    values = {"return": over_time("reward"), "cost_return": over_time("cost")}
+    values = {"return": over_time("reward")}
+    values |= columns("cost_return", over_time("cost"), task.costs)
     if projected := "action_executed" in after:
         shift = torch.stack(
             [

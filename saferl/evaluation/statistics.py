@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from scipy import stats
+
+from saferl.evaluation.costs import limits
 
 #: Name of each figure in ``metrics.json``, its short name in tables, and whether it counts episodes.
 FIGURES = {
@@ -18,6 +20,37 @@ FIGURES = {
     "cost_return": ("cost return", False),
     "intervention_rate": ("intervention", False),
 }
+
+#: With which the names of each of several costs begin (:mod:`saferl.evaluation.costs`).
+COST = "cost_return_"
+
+
+def short(name: str) -> str:
+    """What tables call a figure.
+
+    >>> short("cost_return"), short("cost_return_speed")
+    ('cost return', 'cost speed')
+    """
+    return FIGURES[name][0] if name in FIGURES else f"cost {name.removeprefix(COST)}"
+
+
+def is_figure(name: str) -> bool:
+    """Whether a figure has this name."""
+    return name in FIGURES or name.startswith(COST)
+
+
+def each_cost(figure: str, there: Iterable[str]) -> list[str]:
+    """The names of a figure among those that are there: its own, and of costs those of each.
+
+    >>> each_cost("cost_return", ["cost_return_road", "return", "cost_return_speed"]), each_cost("return", ["speed"])
+    (['cost_return_road', 'cost_return_speed'], [])
+    """
+    return [
+        name
+        for name in there
+        if name == figure or (figure == "cost_return" and name.startswith(COST))
+    ]
+
 
 #: Episodes of a training that its figures are the mean of.
 WINDOW = 200
@@ -64,7 +97,8 @@ def within(name: str, interval: Interval, values: Sequence[float]) -> Interval:
     if low is None or high is None:
         return None, None
     share = name.endswith("_rate")
-    if share or (name in ("speed", "cost_return") and min(values) >= 0):
+    cost = name == "cost_return" or name.startswith(COST)
+    if share or ((name == "speed" or cost) and min(values) >= 0):
         low = max(low, 0.0)
     return low, min(high, 1.0) if share else high
 
@@ -95,7 +129,7 @@ def summarise(rows: Sequence[dict[str, float]]) -> dict[str, dict[str, float | N
     """Mean and 95% interval of each figure over episodes.
 
     Args:
-        rows: one dict an episode with ``return``, ``cost_return``; with a projector ``intervention_rate`` (share of its
+        rows: one dict an episode with ``return``, ``cost_return`` (or one of each cost); with a projector ``intervention_rate`` (share of its
             decisions); on the road ``collision``, ``success``, ``frozen`` (0 or 1) and ``speed``.
 
     Returns:
@@ -108,19 +142,18 @@ def summarise(rows: Sequence[dict[str, float]]) -> dict[str, dict[str, float | N
     if not rows:
         raise ValueError("summarise needs at least one episode, got none.")
     figures = {}
-    for name, (_, is_rate) in FIGURES.items():
-        column = name.removesuffix("_rate") if is_rate else name
-        if column not in rows[0]:
-            continue
-        values = [float(row[column]) for row in rows]
-        found = wilson(round(sum(values)), len(values)) if is_rate else mean_interval(values)
-        low, high = within(name, found, values)
-        figures[name] = {"mean": sum(values) / len(values), "low": low, "high": high}
+    for figure, (_, is_rate) in FIGURES.items():
+        for column in each_cost(figure.removesuffix("_rate") if is_rate else figure, rows[0]):
+            name = figure if is_rate else column
+            values = [float(row[column]) for row in rows]
+            found = wilson(round(sum(values)), len(values)) if is_rate else mean_interval(values)
+            low, high = within(name, found, values)
+            figures[name] = {"mean": sum(values) / len(values), "low": low, "high": high}
     return figures
 
 
-def verdict(mean: float, low: float | None, cost_limit: float) -> str:
-    """Whether a mean cost keeps its limit, as far as its interval tells.
+def verdict(mean: float, low: float | None, cost_limit: float, name: str = "cost_limit") -> str:
+    """Whether a mean cost keeps its limit, which is called ``name``, as far as its interval tells.
 
     >>> verdict(4.9, 4.5, 5), verdict(5.2, 4.9, 5), verdict(5.2, None, 5), verdict(5.3, 5.1, 5)
     ('cost_limit=5 is kept', 'cost_limit=5 is kept within chance', 'cost_limit=5 is passed', 'cost_limit=5 is broken')
@@ -131,26 +164,31 @@ def verdict(mean: float, low: float | None, cost_limit: float) -> str:
         word = "passed"
     else:
         word = "broken" if low > cost_limit else "kept within chance"
-    return f"cost_limit={cost_limit:g} is {word}"
+    return f"{name}={cost_limit:g} is {word}"
 
 
 def table(
-    figures: dict[str, dict[str, Any]], title: str = "", cost_limit: float | None = None
+    figures: dict[str, dict[str, Any]],
+    title: str = "",
+    cost_limit: float | Sequence[float] | None = None,
 ) -> str:
-    """A plain-text table of :func:`summarise`'s figures; rates in percent, the cost judged by its limit.
+    """A plain-text table of :func:`summarise`'s figures; rates in percent, each cost judged by its limit.
 
     >>> print(table({"cost_return": {"mean": 33.4, "low": 32.1, "high": 34.7}}, cost_limit=30))
                         mean   95% interval
     cost return        33.40   [32.10, 34.70]   cost_limit=30 is broken
     """
+    costs = each_cost("cost_return", figures)
+    allowed = dict(zip(costs, limits(cost_limit, costs), strict=True))
     lines = [title] if title else []
     lines.append(f"{'':<14}{'mean':>10}   95% interval")
     for name, value in figures.items():
-        short, scale = FIGURES[name][0], 100.0 if name.endswith("_rate") else 1.0
+        scale = 100.0 if name.endswith("_rate") else 1.0
         unit = " %" if scale == 100.0 else ""
         interval = span(value["low"], value["high"], ".2f", scale)
-        line = f"{short:<14}{value['mean'] * scale:>10.2f}{unit:<2} {interval}{unit * (interval != '-')}"
-        if name == "cost_return" and cost_limit is not None:
-            line += f"   {verdict(value['mean'], value['low'], cost_limit)}"
+        line = f"{short(name):<14}{value['mean'] * scale:>10.2f}{unit:<2} {interval}{unit * (interval != '-')}"
+        if (limit := allowed.get(name)) is not None:
+            setting = name.replace(COST, "cost_limit.").replace("cost_return", "cost_limit")
+            line += f"   {verdict(value['mean'], value['low'], limit, setting)}"
         lines.append(line)
     return "\n".join(lines)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -60,6 +60,9 @@ class Trace:
               what is compared with the limit. All NaN where the policy has none.
             - ``cost_share`` [N]: what the predicted collision with each car adds to the cost.
             - ``reward`` and ``cost``: of the decision.
+
+            Of K costs ``members``, ``risk``, ``cost`` and ``about``'s ``risk_limit`` have one more dimension [K];
+            :meth:`worst` has not.
     """
 
     about: Mapping[str, Any]
@@ -73,6 +76,29 @@ class Trace:
         """The rows of one episode, by its place in :attr:`episodes`."""
         first = self.episodes["first"]
         return {k: v[first[index] : first[index + 1]] for k, v in self.rows.items()}
+
+    def worst(self) -> Trace:
+        """The trace with one risk: of several that which exceeds its limit most in each row, as if all had the least limit, and
+        the sum of all costs; of one cost the same trace."""
+        if self.rows["cost"].ndim == 1:
+            return self
+        about, rows = dict(self.about), dict(self.rows)
+        limit = np.broadcast_to(
+            0.0 if about["risk_limit"] is None else about["risk_limit"], rows["cost"].shape[1:]
+        )
+        if about["risk_limit"] is not None:
+            about["risk_limit"] = float(limit.min())
+        rows["cost"] = rows["cost"].sum(-1)
+        for end in ("", "_executed"):
+            if rows[f"risk{end}"].ndim > 1:
+                risk = rows[f"risk{end}"] + (limit.min() - limit)
+                which = np.nan_to_num(risk, nan=-np.inf).argmax(-1)[:, None]
+                rows[f"risk{end}"] = np.take_along_axis(risk, which, -1)[:, 0]
+                members = rows[f"members{end}"] + (limit.min() - limit)
+                rows[f"members{end}"] = np.take_along_axis(members, which[:, None], -1)[..., 0]
+        return replace(
+            self, about=about, rows={k: v.astype(self.rows[k].dtype) for k, v in rows.items()}
+        )
 
     def save(self, folder: Path) -> Path:
         """Write ``trace.npz`` into a folder: ``about`` as JSON, the arrays by name."""
@@ -119,7 +145,7 @@ def record(
     rows: Sequence[Mapping[str, Any]],
     /,
     critics: TensorDictModuleBase | None = None,
-    limit: float | None = None,
+    limit: float | Sequence[float] | None = None,
     **about: Any,
 ) -> Trace:
     """Play episodes of a test again and keep every decision.
@@ -260,7 +286,8 @@ def _risks(
         bound: BoundCritics = critics.bind(data[rows].to(device))  # pyright: ignore
         for end, action in names.items():
             mine = action[rows].to(device)
-            members = bound.values(mine).mean(-1).T  # of quantiles their mean
+            members = bound.values(mine).unflatten(-1, (bound.costs, -1)).mean(-1)  # of quantiles
+            members = members.transpose(0, 1).squeeze(-1)
             found.setdefault(f"members{end}", []).append(members.cpu())
             found.setdefault(f"risk{end}", []).append(bound(mine).squeeze(-1).cpu())
     return {name: torch.cat(values) for name, values in found.items()}

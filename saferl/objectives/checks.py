@@ -27,8 +27,8 @@ def check_choice(name: str, value: Any, choices: Any) -> Any:
     return value
 
 
-def check_limit(name: str, limit: float | Sequence[float], count: int) -> Tensor:
-    """A limit on each of ``count`` costs in their units, float32: a scalar that serves all, or [count].
+def check_limit(name: str, limit: float | Sequence[float], count: int | None = None) -> Tensor:
+    """A limit on each of ``count`` costs in their units, float64: a scalar that serves all, or [count].
 
     Raises:
         ValueError: one is negative or not finite, or they are not as many; names it.
@@ -36,7 +36,7 @@ def check_limit(name: str, limit: float | Sequence[float], count: int) -> Tensor
     for each in torch.as_tensor(limit).reshape(-1):
         if not (each.isfinite() and each >= 0):
             raise ValueError(f"{name} must be >= 0, got {limit}.")
-    return as_limit(name, limit, count).float()
+    return as_limit(name, limit, count)
 
 
 def check_gamma(hyperparams: dict[str, Any]) -> None:

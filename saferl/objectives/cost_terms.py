@@ -140,7 +140,7 @@ class CostCriticMixin(LossMixin):
             create_target_params=create_target_params,
             compare_against=compare_against,
         )
-        self.register_buffer("risk_limit", limit.to(self.buffer_device))
+        self.register_buffer("risk_limit", limit.float().to(self.buffer_device))
         # Asked for now, so that a fresh loss loads a state_dict strictly.
         _ = self.value_estimator
 

@@ -161,7 +161,7 @@ class CPOLoss(CostValueMixin, PPOLoss):
         )
         self.add_cost_value(cost_critic)
         device = self.buffer_device
-        self.register_buffer("cost_limit", limit.to(device))
+        self.register_buffer("cost_limit", limit.float().to(device))
         self.out_keys = ["loss_critic", "loss_cost", "explained_variance", "kl", "cost_estimate"]
         self.out_keys += ["step_fraction", *(f"cpo_{name}" for name in CASES)]
         self.trust, self.cg_steps, self.damping = trust, cg_steps, damping

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,23 @@ PANELS = (
     "lagrange_multiplier",
     "intervention_rate",
 )
+#: Those of which several costs have one each, by its name (:mod:`saferl.evaluation.costs`).
+OF_COSTS = ("cost_return", "lagrange_multiplier")
+
+
+def panels(columns: Iterable[str]) -> list[str]:
+    """The panels that these columns of ``metrics.csv`` make, in order.
+
+    >>> panels(["frames", "cost_return_speed", "return", "lagrange_multiplier_speed"])
+    ['return', 'cost_return_speed', 'lagrange_multiplier_speed']
+    """
+    there = list(dict.fromkeys(columns))
+    return [
+        name
+        for panel in PANELS
+        for name in there
+        if name == panel or (panel in OF_COSTS and name.startswith(f"{panel}_"))
+    ]
 
 
 @dataclass(frozen=True)
@@ -42,7 +59,7 @@ class Curve:
 def curves(runs: Sequence[Run]) -> dict[str, dict[str, Curve]]:
     """By figure and system, of the finished runs that have recorded it; figures that none has are left out."""
     found: dict[str, dict[str, Curve]] = {}
-    for figure in PANELS:
+    for figure in panels(name for run in runs for name in run.curve):
         groups: dict[str, list[Mapping[str, np.ndarray]]] = {}
         for run in runs:
             if run.state == FINISHED and np.isfinite(run.curve.get(figure, np.nan)).any():

@@ -14,7 +14,7 @@ from matplotlib.ticker import EngFormatter, PercentFormatter
 
 from saferl.envs.intersection.scene import EGO, INK, OTHERS
 from saferl.evaluation.statistics import WINDOW
-from saferl.report.curves import Curve
+from saferl.report.curves import OF_COSTS, Curve
 from saferl.report.systems import LABELS
 
 _TITLES = {
@@ -29,6 +29,12 @@ _TITLES = {
 #: Each system keeps its colour, whoever stands beside it; the drivers, which learn nothing, need none.
 _COLOURS = dict(zip(list(LABELS)[2:-1], OTHERS, strict=False)) | {"arsac": EGO}
 _FREE = OTHERS[len(_COLOURS) - 1 :]
+
+
+def _title(name: str) -> str:
+    """What heads a panel; of several costs with the cost's name."""
+    figure = next(key for key in (name, *OF_COSTS) if key in _TITLES and name.startswith(key))
+    return f"{_TITLES[figure]}{name.removeprefix(figure).replace('_', ': ', 1)}"
 
 
 def colours(names: list[str]) -> dict[str, str]:
@@ -69,7 +75,7 @@ def draw(curves: Mapping[str, Mapping[str, Curve]], shaped: list[str], out: Path
                 axes.fill_between(
                     curve.frames, curve.low, curve.high, color=colour[system], alpha=0.13, lw=0
                 )
-        title = _TITLES[name]
+        title = _title(name)
         if name == "return" and shaped:
             title += f" (with r_safe: {', '.join(shaped)})"
         axes.set_title(title, fontsize=10, color=INK)
@@ -89,7 +95,7 @@ def draw(curves: Mapping[str, Mapping[str, Curve]], shaped: list[str], out: Path
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(labelsize=8)
         mean = f"of {WINDOW} episodes"
-        if name in ("lagrange_multiplier", "intervention_rate"):
+        if name.startswith("lagrange_multiplier") or name == "intervention_rate":
             mean = "since the last record"
         axes.set_ylabel(f"mean {mean}", fontsize=8)
         axes.set_xlabel("frames", fontsize=8)

@@ -13,7 +13,7 @@ from saferl.checkpoint.run import CONFIG, run_config
 from saferl.config.flat import MADE
 from saferl.evaluation.compare import TESTED
 from saferl.evaluation.rows import read
-from saferl.report.curves import PANELS
+from saferl.report.curves import panels
 from saferl.report.runs import CURVE, FIGURES, FINISHED, TIMING, Run
 from saferl.report.text import write_csv
 
@@ -46,7 +46,7 @@ def publish(runs: Sequence[Run], out: Path) -> list[Path]:
         columns = ("route", *(figure.removesuffix("_rate") for figure in FIGURES))
         test = read((run.folder / TESTED).with_name("episodes.csv"))
         _write({name: test[name] for name in columns}, (folder / TESTED).with_name("episodes.csv"))
-        counted = ("frames", "episodes", "updates", *PANELS)
+        counted = ("frames", "episodes", "updates", *panels(run.curve))
         curve = {name: run.curve[name] for name in counted if name in run.curve}
         _write(curve, folder / CURVE)
         _write({name: column[-1:] for name, column in run.timing.items()}, folder / TIMING)

@@ -56,6 +56,7 @@ def packed(trace: Trace) -> dict[str, Any]:
 
     Angles are folded to (-pi, pi].
     """
+    trace = trace.worst()
     columns, layout = [], []
     for name, scale in SCALES.items():
         values = np.asarray(trace.rows[name], dtype=np.float64)

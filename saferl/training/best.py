@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from saferl.checkpoint.policy import write_policy
+from saferl.evaluation.costs import by_name, limits, names
 
 log = logging.getLogger(__name__)
 
@@ -32,10 +33,13 @@ class BestPolicy:
         run: folder of the run.
         loss: of the policy.
         cfg: the run's configuration.
+        costs: names of the numbers of a cost.
     """
 
-    def __init__(self, run: Path, loss: LossModule, cfg: DictConfig):
-        self.run, self.loss, self.cfg = run, loss, cfg
+    def __init__(
+        self, run: Path, loss: LossModule, cfg: DictConfig, costs: Sequence[str] = ("cost",)
+    ):
+        self.run, self.loss, self.cfg, self.costs = run, loss, cfg, costs
         self.score: list[float] = []
         self.since = -1
 
@@ -55,7 +59,8 @@ class BestPolicy:
         """Keep the policy as it is now, if it is better.
 
         Args:
-            episodes: of the last training episodes ``return``, ``cost_return`` and outcomes, [n] each.
+            episodes: of the last training episodes ``return``, ``cost_return`` and outcomes, [n] each, or [n, K] of several
+                costs.
             counted: frames, episodes and updates so far.
             check: raises where something that is learned is not finite.
         """
@@ -66,15 +71,20 @@ class BestPolicy:
         count = min(counted["episodes"] - self.since, len(episodes["return"]))
         if count < LEAST:
             return
-        means = {name: float(value[-count:].double().mean()) for name, value in episodes.items()}
+        figures = by_name(episodes, self.costs)
+        means = {name: float(value[-count:].double().mean()) for name, value in figures.items()}
         if not all(map(math.isfinite, means.values())):
             return
-        limit = self.cfg.cost_limit
-        within = limit is None or means["cost_return"] <= limit
+        paid = {name: means[name] for name in names("cost_return", self.costs)}
+        allowed = limits(self.cfg.cost_limit, self.costs)
+        within = all(
+            limit is None or cost <= limit
+            for cost, limit in zip(paid.values(), allowed, strict=True)
+        )
         score = [float(within), means.get("success", means["return"])]
         if self.score and score <= self.score:
             return
         check()
         self.score = score
-        about = {"return": means["return"], "cost_return": means["cost_return"], "within": within}
+        about = {"return": means["return"], **paid, "within": within}
         write_policy(self.run / BEST, self.loss.state_dict(), self.cfg, {**counted, **about})

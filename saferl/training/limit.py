@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from typing import Any
 
 from torch import Tensor
 
+from saferl.evaluation.costs import limits, names
 from saferl.evaluation.statistics import mean_interval, span, verdict
 
 log = logging.getLogger(__name__)
@@ -22,10 +24,11 @@ class CostWatch:
     Args:
         limit: ``cost_limit``, undiscounted; None: there is none, and nothing is said.
         window: of how many episodes the mean counts.
+        name: what the limit is called.
     """
 
-    def __init__(self, limit: float | None = None, window: int = 200):
-        self.limit, self.window = limit, window
+    def __init__(self, limit: Any = None, window: int = 200, name: str = "cost_limit"):
+        self.limit, self.window, self.name = limit, window, name
         self.dearest, self.bound = 0.0, False
         self.said: list[str] = []
 
@@ -67,14 +70,16 @@ class CostWatch:
         mean = float(costs.mean())
         if not self.bound and spent >= EARLY and self.first("idle"):
             log.warning(
-                "cost_limit=%g has limited nothing so far: no episode cost more than %.4g.",
+                "%s=%g has limited nothing so far: no episode cost more than %.4g.",
+                self.name,
                 self.limit,
                 self.dearest,
             )
         kept = self.bound and mean <= self.limit and len(costs) >= self.window
         if kept and self.first("met"):
             log.info(
-                "cost_limit=%g is met at frame %d: the last %d episodes cost %.4g in the mean.",
+                "%s=%g is met at frame %d: the last %d episodes cost %.4g in the mean.",
+                self.name,
                 self.limit,
                 frames,
                 len(costs),
@@ -86,9 +91,9 @@ class CostWatch:
         if self.limit is None or costs is None or not len(costs):
             return
         mean, (low, high) = float(costs.mean()), mean_interval(costs.tolist())
-        said = verdict(mean, low, self.limit)
+        said = verdict(mean, low, self.limit, self.name)
         if not self.bound:
-            said = f"cost_limit={self.limit:g} never bound, no episode cost as much"
+            said = f"{self.name}={self.limit:g} never bound, no episode cost as much"
         well = self.bound and not (low is not None and low > self.limit)
         log.log(
             logging.INFO if well else logging.WARNING,
@@ -98,3 +103,51 @@ class CostWatch:
             mean,
             span(low, high, ".4g"),
         )
+
+
+class CostWatches(CostWatch):
+    """A watch of each of several limits.
+
+    Args:
+        limit: of each cost; None: there is none.
+        costs: their names.
+        window: of how many episodes the means count.
+    """
+
+    def __init__(self, limit: Sequence[float] | None, costs: Sequence[str], window: int = 200):
+        super().__init__(limit, window)
+        numbered = zip(limits(limit, costs), names("cost_limit", costs, "."), strict=True)
+        self.each = [CostWatch(one, window, name) for one, name in numbered]
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"said": [*self.said], "each": [watch.state_dict() for watch in self.each]}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.said = [*state["said"]]
+        for watch, own in zip(self.each, state["each"], strict=True):
+            watch.load_state_dict(own)
+
+    def take(self, costs: Tensor) -> None:
+        for watch, own in self._of(costs):
+            watch.take(own)
+
+    def look(self, costs: Tensor | None, frames: int, spent: float) -> None:
+        for watch, own in self._of(costs):
+            watch.look(own, frames, spent)
+
+    def judge(self, costs: Tensor | None) -> None:
+        for watch, own in self._of(costs):
+            watch.judge(own)
+
+    def _of(self, costs: Tensor | None) -> list[tuple[CostWatch, Tensor]]:
+        """Each watch and the costs [n] that it is of, of costs [n, K]."""
+        return [] if costs is None else [*zip(self.each, costs.unbind(-1), strict=True)]
+
+
+def watch_of(limit: Any, costs: Sequence[str]) -> CostWatch:
+    """The watch of a limit on one cost, or of those on several.
+
+    >>> watch_of(0.1, ["cost"]).name, len(watch_of([0.1, 0.2], ["road", "speed"]).each)
+    ('cost_limit', 2)
+    """
+    return CostWatch(limit) if len(costs) == 1 else CostWatches(limit, costs)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 
+from saferl.evaluation.costs import by_name, limits, names
 from saferl.evaluation.statistics import FIGURES, WINDOW
 
 #: How episodes ended, [n] by name, from their last steps: :meth:`saferl.envs.task.Task.outcomes`.
@@ -29,7 +30,7 @@ def finished_episodes(data: TensorDictBase, outcomes: Outcomes = no_outcomes) ->
         outcomes: the task's own.
 
     Returns:
-        [n] TensorDict of float ``return``, ``cost_return`` and the outcomes.
+        [n] TensorDict of float ``return``, ``cost_return`` ([n, K] of several costs) and the outcomes.
     """
     after = data.get("next")
     ends = after[after["done"].squeeze(-1)]
@@ -49,20 +50,26 @@ class EpisodeWindow:
     Args:
         outcomes: how the task's episodes end.
         length: how many episodes.
+        costs: names of the numbers of a cost.
 
     >>> EpisodeWindow().short()
     {}
     """
 
-    def __init__(self, outcomes: Outcomes = no_outcomes, length: int = WINDOW):
-        self.outcomes, self.length = outcomes, length
+    def __init__(
+        self,
+        outcomes: Outcomes = no_outcomes,
+        length: int = WINDOW,
+        costs: Sequence[str] = ("cost",),
+    ):
+        self.outcomes, self.length, self.costs = outcomes, length, costs
         self.values: dict[str, torch.Tensor] = {}
 
     def extend(self, data: TensorDictBase) -> TensorDict:
         """Take collected data [*B, T]; returns its finished episodes [n]."""
         episodes = finished_episodes(data, self.outcomes)
         for key, new in episodes.items():
-            old = self.values.get(str(key), torch.zeros(0))
+            old = self.values.get(str(key), new.cpu()[:0])
             self.values[str(key)] = torch.cat([old, new.cpu()])[-self.length :]
         return episodes
 
@@ -70,19 +77,20 @@ class EpisodeWindow:
         """Mean return, cost return and rates of the window; NaN before the first episode."""
         return {
             f"{key}_rate" if f"{key}_rate" in FIGURES else key: round(float(value.mean()), 6)
-            for key, value in self.values.items()
+            for key, value in by_name(self.values, self.costs).items()
         }
 
-    def short(self, cost_limit: float | None = None) -> dict[str, str]:
-        """The summary for a progress bar, the cost beside its limit; empty before the first episode."""
+    def short(self, cost_limit: float | Sequence[float] | None = None) -> dict[str, str]:
+        """The summary for a progress bar, each cost beside its limit; empty before the first episode."""
         if not any(map(len, self.values.values())):
             return {}
         figures = self.summary()
-        limit = "" if cost_limit is None else f" of {cost_limit:g}"
-        bar = {
-            "return": f"{figures['return']:.1f}",
-            "cost": f"{figures['cost_return']:.3f}{limit}",
-        }
+        bar = {"return": f"{figures['return']:.1f}"}
+        for key, limit in zip(
+            names("cost_return", self.costs), limits(cost_limit, self.costs), strict=True
+        ):
+            beside = "" if limit is None else f" of {limit:g}"
+            bar[key.replace("cost_return", "cost")] = f"{figures[key]:.3f}{beside}"
         rates = {"CR": "collision_rate", "SR": "success_rate"}
         return bar | {name: f"{figures[key]:.0%}" for name, key in rates.items() if key in figures}
 

@@ -20,6 +20,7 @@ from torchrl.record.loggers import Logger
 
 from saferl.checkpoint.run import RunCheckpoint
 from saferl.checkpoint.state import Fitting, GrowingFiles
+from saferl.evaluation.costs import scalars
 from saferl.evaluation.progress import bar
 from saferl.training.best import BestPolicy
 from saferl.training.collector import WholeCollector
@@ -93,11 +94,12 @@ class Trainer:
         save_every: frames between two checkpoints.
         save_minutes: of wall-clock, after which a checkpoint is due all the same; None: never.
         after_collect: called with each batch's finished episodes (a TensorDict of per-episode
-            ``return``, ``cost_return`` and outcomes, [n]) and the fraction of the budget spent.
+            ``return``, ``cost_return`` and outcomes, [n]; [n, K] of several costs) and the fraction of the budget spent.
         open_loggers: makes the TorchRL loggers that receive the scalars of each row; called when
             training starts.
         window: means over the last episodes.
         watch: of the limit on the mean cost of an episode.
+        costs: names of the K numbers of a cost.
         watchdog: of the critics' values; None: they are not looked at.
         best: keeps the best policy so far; None: only the newest checkpoint is kept.
     """
@@ -112,6 +114,7 @@ class Trainer:
     save_minutes: float | None = 5.0
     window: EpisodeWindow = field(default_factory=EpisodeWindow)
     watch: CostWatch = field(default_factory=CostWatch)
+    costs: Sequence[str] = ("cost",)
     watchdog: Watchdog | None = None
     best: BestPolicy | None = None
     after_collect: list[Callable[[TensorDictBase, float], None]] = field(default_factory=list)
@@ -163,7 +166,7 @@ class Trainer:
 
     @property
     def _costs(self) -> Tensor | None:
-        """Of the last episodes [n]."""
+        """Of the last episodes [n], of several costs [n, K]."""
         return self.window.values.get("cost_return")
 
     @property
@@ -300,9 +303,9 @@ class Trainer:
         with self.clock.phase("learn"):
             for batch in self.experience.batches(data, progress.frames):
                 progress.updates += 1
-                for name, value in self.learner.update(batch).items():
-                    if value.numel() == 1:
-                        self.means.add(name, value)
+                for key, value in self.learner.update(batch).items():
+                    for name, number in scalars(key, value, self.costs).items():
+                        self.means.add(name, number)
         return finished
 
     def _record(self, data: TensorDictBase) -> None:

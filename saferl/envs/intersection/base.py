@@ -20,6 +20,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from saferl.envs.intersection.collision_cost import CollisionCost
+from saferl.envs.intersection.costs import COSTS
 from saferl.envs.intersection.drivers import DRIVERS
 from saferl.envs.intersection.geometry import ROUTES, ROUTES_OF_TASK, TASK_OF_ROUTE
 from saferl.envs.intersection.observation import FORMS, ROWS, Form, reading
@@ -79,6 +80,8 @@ class Scenario(Task):
             nothing more can be earned, so that the value of standing does not rest on itself. None:
             never.
         reward, cost: see :class:`Reward` and :class:`CollisionCost`.
+        costs: what ``cost`` holds, names in :data:`COSTS`: ``cost``, collisions and the road in one; or several of
+            ``collision``, ``road``, ``comfort``, ``speed``.
 
     >>> Scenario(task="uturn")
     Traceback (most recent call last):
@@ -99,6 +102,7 @@ class Scenario(Task):
     standstill: float | None = None
     reward: Reward = field(default_factory=Reward)
     cost: CollisionCost = field(default_factory=CollisionCost)
+    costs: tuple[str, ...] = ("cost",)
 
     def __post_init__(self):
         if self.task not in ROUTES_OF_TASK:
@@ -125,6 +129,11 @@ class Scenario(Task):
         if self.scenario not in SCENARIOS:
             raise ValueError(
                 f"scenario must be one of {', '.join(SCENARIOS)}, got {self.scenario!r}."
+            )
+        object.__setattr__(self, "costs", tuple(self.costs))
+        if not set(self.costs) <= set(COSTS) or not 0 < len(set(self.costs)) == len(self.costs):
+            raise ValueError(
+                f"costs must be different names among {', '.join(COSTS)}, got {', '.join(self.costs) or 'none'}."
             )
         traffic = build("traffic", SCENARIOS[self.scenario], self.traffic)
         if self.vehicles is not None:
@@ -277,7 +286,7 @@ class IntersectionBase(SeededEnv):
 
     Reads ``action`` [B, 2] in [-1, 1]: a_x / 5 m/s^2, delta_f / 0.6 rad. Writes ``ego`` [B, F] and
     ``vehicles`` [B, M, G] (:func:`observe`), ``route`` [B, 1] int64, the outcomes ``collision``,
-    ``offroad``, ``success`` [B, 1] bool, and ``reward`` and ``cost`` [B, 1].
+    ``offroad``, ``success`` [B, 1] bool, ``reward`` [B, 1] and ``cost`` [B, K].
     """
 
     def __init__(self, task: Scenario, num_envs: int, seed: int | None, device=None):
@@ -301,7 +310,7 @@ class IntersectionBase(SeededEnv):
     def _output(self, values: dict[str, Tensor]) -> TensorDict:
         """Shape [B] tensors to the specs' [B, 1]."""
         out = {
-            key: value if key in ("ego", "vehicles") else value.reshape(*self.batch_size, 1)
+            key: value if key in ("ego", "vehicles") else value.reshape(*self.batch_size, -1)
             for key, value in values.items()
         }
         return TensorDict(self._reals(out), batch_size=self.batch_size, device=self.device)

@@ -17,6 +17,7 @@ from saferl.envs.intersection.base import (
     IntersectionBase,
     Scenario,
 )
+from saferl.envs.intersection.costs import Decision, costs_of
 from saferl.envs.intersection.dynamics import step_ego, to_physical
 from saferl.envs.intersection.geometry import arrived, columns, frame, offroad, separation
 from saferl.envs.intersection.observation import observe
@@ -211,18 +212,20 @@ def advance(
         movers: see :func:`drive`.
 
     Returns:
-        The next state; and outcomes, ``reward``, ``cost`` and ends, each [B].
+        The next state; and outcomes, ``reward`` and ends, each [B], and ``cost`` [B, K].
     """
     # Laid out like the rest: the action that comes in is not.
     control = columns(*to_physical(action).unbind(-1))
     previous = torch.where(state["steps"][:, None] == 0, control, state["control"])
-    cost = scenario.cost(state["ego"], control, states_of(state), state["within_view"])
+    predicted = scenario.cost(state["ego"], control, states_of(state), state["within_view"])
     after, gap = drive(scenario, state, control, movers)
     ego, route, collision = after["ego"], after["route"], gap <= 0
     seen, own = look(scenario, after)
     after |= seen
     off = offroad(ego)
-    cost = scenario.cost.with_crash(cost, off | collision)
+    seconds = 1.0 / scenario.policy_frequency
+    decision = Decision(scenario.cost, predicted, collision, off, ego, control, seconds)
+    cost = costs_of(scenario.costs, decision)
     success = arrived(ego, route) & ~off & ~collision
     reward = scenario.reward(
         ego, route, control, previous, own[:, -2], own[:, -1], seen["within_view"].any(-1),

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
+from torch import Tensor
 
 from saferl.envs.intersection.base import STANDING, SUBSTEPS, Scenario, build
 from saferl.envs.intersection.collision_cost import CollisionCost
+from saferl.envs.intersection.costs import Decision, costs_of
 from saferl.envs.intersection.dynamics import to_physical
 from saferl.envs.intersection.geometry import (
     ROUTES,
@@ -42,8 +44,8 @@ class IntersectionEnv(gymnasium.Env):
 
     The observation is a dict of ``ego`` [F] and ``vehicles`` [rows, G] (:func:`observe`, SI units),
     the action [2] in [-1, 1] is (a_x / 5 m/s^2, delta_f / 0.6 rad). ``info`` holds ``cost``
-    (:class:`CollisionCost` of the state before the step and the executed action; 0.0 at reset), the outcomes
-    ``collision``, ``offroad``, ``success``, and ``route`` and ``task``.
+    (:class:`CollisionCost` of the state before the step and the executed action; 0.0 at reset; an array [K] of several
+    ``costs``), the outcomes ``collision``, ``offroad``, ``success``, and ``route`` and ``task``.
 
     All randomness comes from ``np_random``: the same seed and actions give the same episode, bit
     for bit. ``reset`` takes ``options``: ``task`` (one episode on another task), ``route`` (a name
@@ -54,6 +56,7 @@ class IntersectionEnv(gymnasium.Env):
             see :class:`Scenario`.
         reward: a :class:`Reward` or its fields, e.g. ``{"reading": "raw", "risk_shaping": True}``.
         cost: a :class:`CollisionCost` or its fields.
+        costs: names, see :class:`Scenario`.
         render_mode: None or ``rgb_array``.
 
     >>> env = IntersectionEnv(task="lt")
@@ -78,6 +81,7 @@ class IntersectionEnv(gymnasium.Env):
         standstill: float | None = None,
         reward: Reward | Mapping[str, Any] | None = None,
         cost: CollisionCost | Mapping[str, Any] | None = None,
+        costs: Sequence[str] = ("cost",),
         render_mode: str | None = None,
     ):
         settings: Any = traffic or {}
@@ -85,7 +89,7 @@ class IntersectionEnv(gymnasium.Env):
             task=task, vehicles=vehicles, scenario=scenario, traffic=settings, rows=rows,
             observation=observation, policy_frequency=policy_frequency, duration=duration, route_starts=route_starts,
             standstill=standstill, reward=build("reward", Reward(), reward or {}),
-            cost=build("cost", CollisionCost(), cost or {}),
+            cost=build("cost", CollisionCost(), cost or {}), costs=tuple(costs),
         )  # fmt: skip
         modes = self.metadata["render_modes"]
         if render_mode is not None and render_mode not in modes:
@@ -153,7 +157,9 @@ class IntersectionEnv(gymnasium.Env):
         self._seed, self._steps, self._still, self._control = draw, 0, 0, None
         traffic = draw_traffic(self.scenario.traffic, self._route, start, draw)
         self.road.populate(ego, drive_in(traffic, torch.float64))
-        return self._observe(), self._info(0.0, False, False, False)
+        return self._observe(), self._info(
+            torch.zeros(len(self.scenario.costs)), False, False, False
+        )
 
     def _observe(self) -> dict[str, np.ndarray]:
         scenario, state = self.scenario, self.ego.state
@@ -173,10 +179,10 @@ class IntersectionEnv(gymnasium.Env):
         now, steps = self.road.surrounding, torch.tensor(self._steps)
         self.road.replace(respawn(self.scenario.traffic, now, self._route, self._seed, steps))
 
-    def _info(self, cost: float, collision: bool, off: bool, success: bool) -> dict[str, Any]:
+    def _info(self, cost: Tensor, collision: bool, off: bool, success: bool) -> dict[str, Any]:
         route = int(self._route)
         return {
-            "cost": cost,
+            "cost": cost.numpy() if len(cost) > 1 else float(cost),
             "collision": collision,
             "offroad": off,
             "success": success,
@@ -209,7 +215,13 @@ class IntersectionEnv(gymnasium.Env):
         self._control, self._steps = control, self._steps + 1
         observation = self._observe()
         off = bool(offroad(ego.state))
-        cost = float(scenario.cost.with_crash(predicted, torch.tensor(off or collision)))
+        hit, left, seconds = (
+            torch.tensor(collision),
+            torch.tensor(off),
+            1.0 / scenario.policy_frequency,
+        )
+        decision = Decision(scenario.cost, predicted, hit, left, ego.state, control, seconds)
+        cost = costs_of(scenario.costs, decision)
         success = not (collision or off) and bool(arrived(ego.state, self._route))
         reward = scenario.reward(
             ego.state, self._route, control, previous, self._own[-2], self._own[-1],
