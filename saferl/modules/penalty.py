@@ -67,7 +67,7 @@ class Switch(LagrangeMultiplier):
         >>> switch.update(torch.tensor([[0.2, 0.3]]))
         >>> switch.value.tolist()
         [0.0, 1.0]
-        >>> switch.update(torch.tensor([[0.1, 0.05]]))
+        >>> switch.update(torch.tensor([[0.05, -0.2]]))
         >>> switch.value.tolist()
         [0.0, 0.0]
     """

@@ -13,7 +13,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.objectives import SACLoss
+from torch.distributions import Distribution
+from torchrl.objectives import ClipPPOLoss, SACLoss
 
 from saferl.objectives.checks import check_gamma
 
@@ -120,3 +121,21 @@ class SACTerms(SACLoss):
 
     def _alpha_loss(self, log_prob: Tensor) -> Tensor:
         return self.temperature_term(log_prob)
+
+
+class PPOTerms(ClipPPOLoss):
+    """:class:`~torchrl.objectives.ClipPPOLoss` with what its objective is made of in the open."""
+
+    def log_ratio(self, tensordict: TensorDictBase) -> tuple[Tensor, Distribution]:
+        """Of the policy's probability of each action to that of the policy that acted ``[*B, 1]``, and the policy."""
+        log_ratio, policy, *_ = self._log_weight(tensordict.copy(), adv_shape=tensordict.shape)
+        return log_ratio, policy
+
+    def clip(self, log_ratio: Tensor) -> Tensor:
+        """The logarithm of a ratio that is held within ``clip_epsilon`` of 1."""
+        return log_ratio.clamp(*self._clip_bounds)
+
+    def standardised(self, tensordict: TensorDictBase) -> Tensor:
+        """``"advantage"`` as the objective has it ``[*B, 1]``."""
+        advantage = tensordict.get(self.tensor_keys.advantage)
+        return self._maybe_normalize_advantage(advantage, tensordict, update_norm=False)

@@ -113,13 +113,11 @@ class FOCOPSLoss(PPOLagLoss):
 
     def policy_terms(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
         old = self.actor_network.build_dist_from_params(tensordict)
-        advantage = self._maybe_normalize_advantage(
-            tensordict.get(self.tensor_keys.advantage), tensordict, update_norm=False
-        )
-        log_ratio, new, *_ = self._log_weight(tensordict.copy(), adv_shape=advantage.shape[:-1])
+        log_ratio, new = self.log_ratio(tensordict)
         kl = kl_divergence(new, old).unsqueeze(-1)
         near = kl.detach() <= self.trust
-        loss = near * (kl - log_ratio.exp() * advantage / self.temperature)
+        gain = log_ratio.exp() * self.standardised(tensordict)
+        loss = near * (kl - gain / self.temperature)
         return {
             "loss_objective": self.reduced(loss, tensordict).squeeze(-1),
             "kl": kl.detach().mean(),

@@ -91,7 +91,6 @@ class P3OLoss(PPOLagLoss):
         """What the policy's change adds to the costs ``[K]``, for each decision, clipped on the cautious side."""
         cost = tensordict.get(self.tensor_keys.cost_advantage)
         cost = cost - cost.flatten(0, -2).mean(0)
-        log_ratio, *_ = self._log_weight(tensordict, adv_shape=cost.shape[:-1])
-        clipped = log_ratio.clamp(*self._clip_bounds)
-        worse = torch.maximum(log_ratio.exp() * cost, clipped.exp() * cost)
+        log_ratio, _ = self.log_ratio(tensordict)
+        worse = torch.maximum(log_ratio.exp() * cost, self.clip(log_ratio).exp() * cost)
         return torch.stack([self.reduced(each, tensordict, "mean") for each in worse.unbind(-1)])

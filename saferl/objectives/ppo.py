@@ -10,16 +10,16 @@ from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.utils import distance_loss
 
 from saferl.modules import BoundCritics, CriticEnsemble, LagrangeMultiplier, Largest
+from saferl.objectives.adapter import PPOTerms
 from saferl.objectives.advantages import CostValueKeys, CostValueMixin
 from saferl.objectives.checks import check_begun, check_lagrange, check_risk
 from saferl.objectives.cost_terms import quantile_loss
 
 
-class PPOLagLoss(CostValueMixin, ClipPPOLoss):
+class PPOLagLoss(CostValueMixin, PPOTerms):
     r"""Clipped PPO with a cost critic and a Lagrange multiplier (Ray, Achiam and Amodei, 2019).
 
     .. math::

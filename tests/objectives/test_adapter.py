@@ -10,7 +10,7 @@ import torch
 from torchrl.objectives import ClipPPOLoss, PPOLoss, SACLoss
 
 import saferl.objectives
-from saferl.objectives import CPOLoss, PPOLagLoss, RiskPPOLoss, SACLagLoss
+from saferl.objectives import CPOLoss, FOCOPSLoss, P3OLoss, PPOLagLoss, RiskPPOLoss, SACLagLoss
 from saferl.objectives.adapter import LossMixin
 
 FOLDER = Path(saferl.objectives.__file__).parent
@@ -33,7 +33,9 @@ def test_the_adapter_alone_touches_what_is_torchrls_own(path: Path):
         assert {"_reduce_loss", "_alpha_loss"} <= private
 
 
-@pytest.mark.parametrize("kind", [SACLagLoss, PPOLagLoss, RiskPPOLoss, CPOLoss])
+@pytest.mark.parametrize(
+    "kind", [SACLagLoss, PPOLagLoss, RiskPPOLoss, CPOLoss, P3OLoss, FOCOPSLoss]
+)
 def test_a_mixin_hides_no_method_of_the_loss_behind_it(kind: type):
     """super() from a loss of ours reaches the one of TorchRL."""
     mixins = [base for base in kind.__mro__ if issubclass(base, LossMixin)]

@@ -29,10 +29,11 @@ from omnisafe_fixture import (
 )
 from tensordict import TensorDict
 from torch import Tensor
-from torchrl.objectives import ClipPPOLoss, SoftUpdate
+from torchrl.objectives import SoftUpdate
 
 from saferl.modules import DualAscent
 from saferl.objectives import SACLagLoss
+from saferl.objectives.adapter import PPOTerms
 
 
 @pytest.fixture(autouse=True)
@@ -153,13 +154,13 @@ def test_ppo_lag(monkeypatch):
     for name, leaf in named(loss.actor_network_params).items():
         leaf.data.copy_(torch.tensor(found["weights"]["actor_after"][name]))
     seen = []
-    clipped = ClipPPOLoss.forward
+    clipped = PPOTerms.forward
 
     def listen(self, tensordict):
         seen.append(tensordict["advantage"].squeeze(-1))
         return clipped(self, tensordict)
 
-    monkeypatch.setattr(ClipPPOLoss, "forward", listen)
+    monkeypatch.setattr(PPOTerms, "forward", listen)
     out = loss(data)
     assert_agrees(seen[0], found["advantage"])
     ratio = torch.tensor(found["ratio"])
