@@ -16,7 +16,8 @@ from saferl.algorithms.parts import make
 from saferl.algorithms.policy import compiling
 from saferl.checkpoint.lock import alone
 from saferl.checkpoint.run import CONFIG, begun, progress, run_config, run_folder
-from saferl.cli.evaluate import Candidate, drawn, measure, pictures
+from saferl.cli.candidate import Candidate
+from saferl.cli.evaluate import drawn, measure, pictures
 from saferl.cli.launch import job_folder
 from saferl.config.flat import MADE
 from saferl.config.limits import check_limits
