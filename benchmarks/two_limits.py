@@ -34,12 +34,12 @@ CART = Cart(costs=("effort", "motion"))
 LIMITS, GAMMA, HORIZON, FOREVER = (0.25, 0.5), 0.9, 20, 80
 #: What each needs beside the limits.
 SETTINGS = {
-    "sac_lag": (),
+    "sac_lag": ("frames=200000",),
     "ppo_lag": ("learning.epochs=5", "loss.entropy_bonus=false", "frames=800000"),
 }
 PROBLEM = (
     "experiment=cart", f"task.costs=[{','.join(CART.costs)}]", f"cost_limit={[*LIMITS]}".replace(" ", ""),
-    "logger=none", "threads=1",
+    "logger=none", "threads=1", "compile=true",
 )  # fmt: skip
 
 

@@ -19,6 +19,7 @@ from omegaconf import DictConfig
 from small import EMPTY, SMALL, compose
 
 from saferl.algorithms.assemble import build_agent, complete
+from saferl.cli.arguments import readable
 from saferl.config import schema
 from saferl.config.catalog import main as catalog
 from saferl.config.check import check
@@ -118,7 +119,7 @@ def saferl(command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
             assert not left.value.code
             return
         if not any(argument.startswith(("-", "hydra/")) for argument in arguments):
-            schema.check(compose(*arguments, config=config))  # as it stands there
+            schema.check(compose(*readable(arguments), config=config))  # as it stands there
         with pytest.MonkeyPatch.context() as patch:
             if door == "train" and not is_read(arguments, later):
                 patch.setattr("saferl.cli.train.build_trainer", Built)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -122,7 +123,7 @@ class CPOLoss(CostValueMixin, PPOLoss):
         critic_network: TensorDictModule,
         cost_critic: TensorDictModule,
         *,
-        cost_limit: float = 0.05,
+        cost_limit: float | Sequence[float] = 0.05,
         trust: float = 0.01,
         cg_steps: int = 15,
         damping: float = 0.1,

@@ -82,3 +82,33 @@ def test_state_goes_on_where_it_was():
     step = env._step(still(env.reset().clone()))  # both from here: reset draws the next episodes
     same = other._step(still(other.reset().clone()))
     assert torch.equal(step["observation"], same["observation"])
+
+
+def test_the_optimum_under_two_limits():
+    """Both bind, and no linear policy near it that keeps them returns more."""
+    cart, limits = Cart(costs=("effort", "motion")), (0.25, 0.5)
+    gain = cart.optimum(limits, 0.9, 1.0, 20)
+    assert cart.sums(gain, 1.0, 20)[1:] == pytest.approx(limits, rel=1e-6)
+    best, draw, kept = cart.sums(gain, 0.9)[0], np.random.default_rng(0), 0
+    for _ in range(200):
+        moved = gain + 0.05 * draw.normal(size=2)
+        costs = np.array(cart.sums(moved, 1.0, 20)[1:])
+        if (costs <= limits).all():
+            kept += 1
+            assert cart.sums(moved, 0.9)[0] < best
+    assert kept > 8
+    with pytest.raises(ValueError, match="does not bind"):
+        cart.optimum((0.25, 5.0), 0.9, 1.0, 20)
+    with pytest.raises(ValueError, match=r"task.costs must be \[effort\] or \[effort,motion\]"):
+        Cart(costs=("motion",))
+
+
+def test_two_costs_of_played_episodes():
+    """Their sums are those of the closed form."""
+    cart = Cart(costs=("effort", "motion"))
+    gain = torch.tensor(cart.optimum((0.25, 0.5), 0.9, 1.0, 20), dtype=torch.float32)
+    env = CartEnv(cart, num_envs=4000, seed=0)
+    policy = lambda td: td.set("action", -(td["observation"] @ gain)[:, None])  # noqa: E731
+    cost = env.rollout(20, policy)["next", "cost"].sum(1)
+    error = cost.std(0) / len(cost) ** 0.5
+    assert ((cost.mean(0) - torch.tensor([0.25, 0.5])).abs() < 4 * error).all()

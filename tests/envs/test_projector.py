@@ -256,3 +256,22 @@ def test_settings_are_checked_at_once():
     for risk in (None, blind):
         with pytest.raises(ValueError, match="risk must be a TensorDictModule that reads 'action'"):
             SafetyProjector(risk, 0.5)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("shape", [(4,), (2, 3)])
+def test_several_risks_each_have_their_limit(shape):
+    """Each coordinate of the action is a risk; corrected where either passes its limit, and told apart."""
+    risk = TensorDictModule(lambda _, action: action[..., :2], ["observation", "action"], ["risk"])
+    both = SafetyProjector(risk, [0.2, 0.6], penalty=10.0)
+    env = TransformedEnv(EchoEnv(shape), both)
+    check_env_specs(env)
+    env.set_seed(0)
+    step = (data := env.rollout(12, break_when_any_done=False))["next"]
+    limit = torch.tensor([0.2, 0.6])
+    torch.testing.assert_close(step["risk_before"], data["action"][..., :2])
+    torch.testing.assert_close(step["risk_after"], step["felt"][..., :2])
+    risky = step["risk_before"] > limit
+    assert (risky.any(-1) & ~risky.all(-1)).any() and not risky.any(-1).all()
+    assert torch.equal(step["intervened"], risky.any(-1, keepdim=True)) and step["feasible"].all()
+    assert both.limit == [0.2, 0.6]

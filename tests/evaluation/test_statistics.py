@@ -139,3 +139,17 @@ def test_a_log_without_room_is_named(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(CsvLog, "_write", full)
     with pytest.raises(OSError, match=r"No space left on device: .*log\.csv"):
         CsvLog(tmp_path / "log.csv").write({"a": 1.0})
+
+
+def test_each_of_several_costs_has_a_row_and_a_verdict():
+    rows = [
+        {"return": 1.0, "cost_return_road": road, "cost_return_speed": 2.0, "success": 1}
+        for road in (0.1, 0.3)
+    ]
+    figures = summarise(rows)
+    assert [*figures] == ["success_rate", "return", "cost_return_road", "cost_return_speed"]
+    assert figures["cost_return_road"]["mean"] == pytest.approx(0.2)
+    lines = table(figures, cost_limit=[0.5, 1.0]).splitlines()
+    assert lines[-2].startswith("cost road") and lines[-2].endswith("cost_limit.road=0.5 is kept")
+    assert lines[-1].startswith("cost speed") and lines[-1].endswith("cost_limit.speed=1 is broken")
+    assert "cost_limit" not in table(figures)

@@ -256,3 +256,18 @@ def test_executed_actions_are_in_physical_units(blind):
     np.testing.assert_allclose(
         trace.episode(0)["executed"][0], to_physical(step["action"])[0], atol=1e-5
     )
+
+
+def test_the_worst_of_several_risks():
+    """In each row the one that exceeds its limit most, as if all had the least limit; the members of that cost."""
+    risk = np.array([[0.3, 0.2], [0.1, 0.9], [np.nan, np.nan]], np.float32)
+    members = np.stack([risk, risk - 0.1], 1)
+    rows = {"risk": risk, "risk_executed": risk, "members": members, "members_executed": members}
+    rows |= {"cost": np.array([[1.0, 2.0], [0.0, 0.5], [np.nan, np.nan]], np.float32)}
+    worst = Trace({"risk_limit": [0.1, 0.5]}, {}, rows).worst()
+    assert worst.about["risk_limit"] == 0.1
+    np.testing.assert_allclose(worst.rows["risk"], [0.3, 0.5, np.nan], rtol=1e-6)
+    np.testing.assert_allclose(worst.rows["members"][:2], [[0.3, 0.2], [0.5, 0.4]], rtol=1e-6)
+    np.testing.assert_allclose(worst.rows["cost"], [3.0, 0.5, np.nan])
+    one = Trace({"risk_limit": 0.1}, {}, {"cost": risk[:, 0]})
+    assert one.worst() is one

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
 from trainers import collect, trainer_of
 
 from saferl.training.signals import CriticSignal, EpisodeSignal
@@ -59,3 +60,24 @@ def test_critic_signal_ascends_with_every_update(tmp_path: Path):
     assert float(trainer.learner.loss.lagrange.value) == pytest.approx(
         value + 0.5 * float(losses["constraint_violation"]), rel=1e-6
     )
+
+
+def test_each_of_several_multipliers_follows_its_own_limit(tmp_path: Path):
+    """The first cost is within its limit, the second is not; each as a share of its own."""
+    trainer = trainer_of(
+        tmp_path, "algo=sac_lag", "task.duration=1", "frames=200", "task.costs=[road,comfort]",
+        "cost_limit=[5,0.001]",
+    )  # fmt: skip
+    lagrange, seen = trainer.learner.loss.lagrange, []
+    update = lagrange.update
+    lagrange.update = lambda penalty, elapsed: (seen.append(penalty), update(penalty, elapsed))
+    collect(trainer, 12)
+    costs, first = trainer.window.values["cost_return"], seen[0]
+    assert costs.shape[1:] == (2,) and first.shape[1:] == (2,)
+    now = costs[: len(first)].double()
+    scale = now.mean(0).abs().maximum(torch.tensor([5.0, 0.001]))
+    expected = (now - torch.tensor([5.0, 0.001])) / scale
+    torch.testing.assert_close(first.double(), expected)
+    assert lagrange.value[0] < 1 < lagrange.value[1]
+    with pytest.raises(ValueError, match="cost_limit must be a number, or 2 of them, got 3"):
+        EpisodeSignal([1.0, 2.0, 3.0]).register(trainer)
