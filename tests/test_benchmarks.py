@@ -82,6 +82,7 @@ def test_of_nothing(arguments: list[str]):
         ["time_to_safe", "{out}", "--runs", "algo=rsac", "--minutes", "0.2", "--every", "0.1", "--episodes", "4",
          "--jobs", "1", "--peers", "ours", "intersection-v1", "--set", "frames=512", "env.num_envs=16", *FAST],
         ["limits", "{out}", "--algos", "cpo", "--seeds", "0", "--frames", "2500", "--episodes", "3"],
+        ["cart", "{out}", "--algos", "ppo_saute", "cat", "--seeds", "0", "--set", "frames=2560", "evaluation.episodes=3"],
         ["features", "{out}", "--frames", "128", "--episodes", "2", "--seeds", "0", "--jobs", "1", "--set", *FAST],
         ["updates_per_frame", "{out}", "--values", "0.25", "--minutes", "0.05", "--seeds", "0",
          "--task", "gs", "--set", *FAST],

@@ -36,6 +36,8 @@ NOT_RUN = "not run: "
 FEWER = {
     "experiment=paper_comparison": ("algo=sac", "seed=3"),
     "experiment=paper_ablation": ("algo=sac", "seed=3"),
+    "experiment=cart_profile": ("algo=ppo_lag", "lagrange=fixed", "lagrange.multiplier.init=1.0"),
+    "experiment=multiplier_profile": ("lagrange=fixed", "lagrange.multiplier.init=1.0"),
 }
 
 
@@ -151,7 +153,7 @@ def smaller(door: str, arguments: list[str]) -> list[str]:
     fewer = next((FEWER[a] for a in arguments if a in FEWER), ())
     arguments += [each for each in fewer if each.partition("=")[0] not in names]
     small = (*EMPTY, *(SMALL if door == "train" else ("episodes=2", "draw=none")))
-    other = any(re.match(r"task=(gym|cart|tank)", a) for a in arguments)
+    other = any(re.match(r"(task|experiment)=(gym|cart|tank)", a) for a in arguments)
     kept = {"env", "task.vehicles"} if other else {"env"} & names
     small = tuple(a for a in small if a.partition("=")[0] not in kept)
     replaced = {a.partition("=")[0] for a in small} | {"hydra/launcher", "hydra.launcher.n_jobs"}

@@ -2,65 +2,79 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import pytest
 import torch
+from cart import (
+    GAMMA,
+    HORIZON,
+    LIMIT,
+    SETTINGS,
+    Measured,
+    in_each_episode,
+    in_each_step,
+    in_the_mean,
+    measure,
+)
 from small import compose
 from table import Table
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from saferl.algorithms.assemble import build_trainer
-from saferl.envs import Cart, CartEnv
-from saferl.envs.seeding import episode_seeds
-from saferl.evaluation.play import play
+from saferl.algorithms.policy import trained_agent
+from saferl.envs import Cart
 
 QUIET = ("logger=none", "threads=1", "save_minutes=null", "save_every=100000000", "device=cpu")
-LIMIT, GAMMA, HORIZON, FOREVER = 0.2, 0.9, 20, 80
 
 
 def linear(gain: torch.Tensor):
     return lambda td: td.set("action", -(td["observation"] @ gain)[:, None].clamp(-1, 1))
 
 
-def sums(policy, steps: int, gamma: float) -> tuple[float, float]:
-    """Mean discounted reward and cost of a policy's mean actions in 2,000 episodes."""
-    env = CartEnv(dataclasses.replace(Cart(), horizon=steps), num_envs=2000, seed=0)
-    played = play(policy, env, episode_seeds(1, 2000))
-    weight = gamma ** torch.arange(len(played), dtype=torch.float64)
-    reward, cost = (
-        torch.stack([step["next", key].squeeze(-1).mean() for step in played]).double()
-        for key in ("reward", "cost")
-    )
-    return float(weight @ reward), float(weight @ cost)
+def trained(algo: str, seed: int, run: Path) -> Measured:
+    cfg = compose("experiment=cart", f"algo={algo}", f"seed={seed}", *SETTINGS[algo], *QUIET)
+    build_trainer(cfg, run).train()
+    agent = trained_agent(cfg, run)
+    return measure(agent.actor, agent.transforms)
 
 
-#: What each needs beside the limit, which is on the undiscounted cost of an episode.
-PROBLEMS = {
-    "cpo": ("loss.damping=0.01", "learning.rollout_frames=2560", "frames=800000"),
-    "ppo_lag": ("learning.epochs=5", "loss.entropy_bonus=false", "frames=800000"),
-    "sac_lag": (),
-    "sac_pid": (),
-}
+def test_the_best_that_is_known():
+    """Of a linear policy the sums are those of played episodes; who promises more earns less."""
+    gain = torch.tensor(Cart().optimum(LIMIT, GAMMA, 1.0, HORIZON), dtype=torch.float32)
+    played = measure(linear(gain))
+    assert played.cost == pytest.approx(LIMIT, rel=0.05)
+    assert played.gain == pytest.approx(in_the_mean(), rel=0.05)
+    assert in_each_episode(side=12) < in_the_mean() and in_each_step() < in_the_mean()
+
+
+#: On the mean cost of an episode, undiscounted.
+MEAN = [algo for algo in SETTINGS if algo not in ("ppo_saute", "cat")]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize("algo", PROBLEMS)
+@pytest.mark.parametrize("algo", MEAN)
 def test_cart(algo: str, seed: int, tmp_path: Path):
     """Within 5% of the optimum, at a cost of at most 1.05 times the limit."""
-    cfg = compose("experiment=cart", f"algo={algo}", f"seed={seed}", *PROBLEMS[algo], *QUIET)
-    trainer = build_trainer(cfg, tmp_path)
-    trainer.train()
     gain = torch.tensor(Cart().optimum(LIMIT, GAMMA, 1.0, HORIZON), dtype=torch.float32)
-    actor = trainer.collector.policy
-    best, ours = (sums(policy, FOREVER, GAMMA)[0] for policy in (linear(gain), actor))
-    cost = sums(actor, HORIZON, 1.0)[1]
-    print(f"{algo} {seed}: return {ours:.4f} of {best:.4f}, cost {cost:.4f} of {LIMIT}")
-    assert abs(ours - best) <= 0.05 * abs(best)
-    assert cost <= 1.05 * LIMIT
+    best, ours = measure(linear(gain)).gain, trained(algo, seed, tmp_path)
+    print(f"{algo} {seed}: return {ours.gain:.4f} of {best:.4f}, cost {ours.cost:.4f} of {LIMIT}")
+    assert abs(ours.gain - best) <= 0.05 * abs(best)
+    assert ours.cost <= 1.05 * LIMIT
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(("algo", "best"), [("ppo_saute", in_each_episode), ("cat", in_each_step)])
+def test_cart_whose_limit_is_no_mean(algo: str, best, seed: int, tmp_path: Path):
+    """Nearly never beyond the limit, which costs a share of the return that theory does not tell."""
+    ours = trained(algo, seed, tmp_path)
+    share = ours.episodes if algo == "ppo_saute" else ours.steps
+    print(f"{algo} {seed}: return {ours.gain:.4f} of {best():.4f}, {share:.2%} beyond the limit")
+    assert share <= 0.02
+    assert ours.gain >= best() - 0.2 * abs(best())
 
 
 TABLE = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -64,14 +64,17 @@ def points(folder: Path) -> list[Point]:
             moved = lagrange["signal"]["_target_"] is not None
             kind = lagrange["multiplier"]["_target_"].rpartition(".")[2] if moved else "fixed"
             last = _last_multiplier(test.parents[1] / "metrics.csv") if moved else start
-            cost, gain = (
-                tuple(figures[key][end] for end in ("mean", "low", "high"))
-                for key in ("cost_return", "return")
-            )
-            found.append(
-                Point(kind, last, cost, gain, config["cost_limit"], start, config["seed"])  # pyright: ignore
-            )
+            cost, gain = (_interval(figures[key]) for key in ("cost_return", "return"))
+            limit, seed = config["cost_limit"], config["seed"]
+            found.append(Point(kind, last, cost, gain, limit, start, seed))
     return sorted(found, key=lambda point: (not point.fixed, point.multiplier))
+
+
+def _interval(figure: Mapping[str, float | None]) -> tuple[float, float, float]:
+    """The mean and the ends of its interval; of one episode there is none."""
+    mean, *ends = (figure[name] for name in ("mean", "low", "high"))
+    low, high = (mean if end is None else end for end in ends)
+    return mean, low, high  # pyright: ignore[reportReturnType]
 
 
 def _last_multiplier(path: Path) -> float:

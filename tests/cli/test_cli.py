@@ -237,7 +237,7 @@ def test_help_lists_groups_and_settings(command, capsys):
     assert not left.value.code
     text = capsys.readouterr().out
     assert "python -m saferl algo=arsac task=gs" in text and "gamma: 0.99" in text
-    assert "algo: arppo, arsac, arsac_plus, arsac_signed, arsac_unprojected, asac, cpo" in text
+    assert "algo: arppo, arsac, arsac_plus, arsac_signed, arsac_unprojected, asac, cat, cpo" in text
 
 
 def test_a_mistake_in_a_process_of_its_own(spawn, tmp_path: Path):

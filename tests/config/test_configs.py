@@ -29,6 +29,9 @@ LIMITS = ("cost_limit=1", "risk_limit=1")
 BESIDE = {
     "task=gym": ("task.id=Pendulum-v1", "task.cost_key=null", *LIMITS),
     "task=cart": LIMITS,
+    # Which say of themselves whose multiplier it is.
+    "experiment=cart_profile": ("algo=ppo_lag",),
+    "experiment=multiplier_profile": ("algo=ppo_lag",),
 }
 #: Encoder, cost critics, multiplier's signal, projector, r_safe: the table of the paper.
 PARTS = {

@@ -144,6 +144,15 @@ def test_policies_see_their_budget_on_every_kind_of_task(task: str, tmp_path: Pa
         assert (env.rollout(2, agent.actor)["budget"][:, 0] == 1).all()
 
 
+def test_a_run_goes_on_with_the_budget_that_is_left(tmp_path: Path):
+    cfg = compose(*SMALL, *TASKS["cart"], "algo=ppo_saute")
+    stopped, resumed = build_trainer(cfg, tmp_path), build_trainer(cfg, tmp_path)
+    stopped.train()
+    resumed.resume()
+    left = [trainer.collector._carrier["budgeted"] for trainer in (stopped, resumed)]
+    assert torch.equal(*left) and (left[0][:, -1] < 1).all()
+
+
 def test_a_run_reports_what_was_earned(tmp_path: Path):
     """The penalty is the learner's; the episodes' returns are the task's."""
     cfg = compose(*SMALL, *TASKS["cart"], "algo=ppo_saute", "transform.penalty=1000", "frames=48")
