@@ -156,7 +156,8 @@ def smaller(door: str, arguments: list[str]) -> list[str]:
     other = any(re.match(r"(task|experiment)=(gym|cart|tank)", a) for a in arguments)
     kept = {"env", "task.vehicles"} if other else {"env"} & names
     small = tuple(a for a in small if a.partition("=")[0] not in kept)
-    replaced = {a.partition("=")[0] for a in small} | {"hydra/launcher", "hydra.launcher.n_jobs"}
+    replaced = {a.partition("=")[0] for a in small}
+    arguments = [a for a in arguments if not a.startswith(("hydra/launcher", "hydra.launcher."))]
     return [*(a for a in arguments if a.partition("=")[0] not in replaced), *small]
 
 

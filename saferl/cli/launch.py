@@ -78,7 +78,9 @@ def launch(command: str, config: str) -> None:
             raise
 
     try:
-        with NamedTemporaryFile("r", encoding="utf-8") as failures:
+        # Where the jobs are, too, which may be on other machines.
+        here = Path.cwd() if os.access(Path.cwd(), os.W_OK) else None
+        with NamedTemporaryFile("r", encoding="utf-8", prefix=".failures-", dir=here) as failures:
             os.environ[_FAILURES] = failures.name
             hydra.main(version_base="1.3", config_path=config_dir(), config_name=config)(run)()
             if failed := failures.read().splitlines():
@@ -91,6 +93,14 @@ def launch(command: str, config: str) -> None:
         if before == "1":
             raise
         raise SystemExit(f"error: {explain(error, config, sys.argv[1:])}") from None
+    except Exception as error:
+        if before == "1" or type(error).__module__.partition(".")[0] != "submitit":
+            raise
+        first = str(error).strip().partition("\n")[0]
+        raise SystemExit(
+            f"error: a job of the sweep ended before its end ({first}); the folder .submitit of the sweep holds what it said. "
+            "The same command again does what is missing."
+        ) from None
     except KeyboardInterrupt as interrupt:
         print(str(interrupt) or "Interrupted.", file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 #: Settings of where and how a run is made, not of what it is.
-MADE = ("out", "device", "threads", "logger", "save_every", "save_minutes")
+MADE = ("out", "device", "threads", "collector", "logger", "save_every", "save_minutes")
 
 
 def flat(node: Any, prefix: str = "") -> dict[str, Any]:

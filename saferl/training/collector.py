@@ -49,7 +49,15 @@ class WholeCollector(Collector):
         return state
 
     def load_state_dict(self, state_dict: Mapping[str, Any], **kwargs: Any) -> None:
-        """Continue exactly where :meth:`state_dict` was taken."""
+        """Continue exactly where :meth:`state_dict` was taken.
+
+        Raises:
+            ValueError: it is of several workers.
+        """
+        if "workers" in state_dict:
+            raise ValueError(
+                f"collector has {len(state_dict['workers'])} workers there and none here."
+            )
         self._base_env.load_state_dict(state_dict["env"])  # pyright: ignore[reportArgumentType]
         if "transform" in state_dict:
             self.env.transform.load_state_dict(state_dict["transform"])  # pyright: ignore

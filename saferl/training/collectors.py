@@ -12,7 +12,7 @@ from importlib.util import find_spec
 from typing import Any
 
 import torch
-from torchrl.collectors import MultiSyncCollector
+from torchrl.collectors import MultiSyncCollector, RemoteModuleWeightUpdater
 
 from saferl.config.machine import cores
 from saferl.config.schema import above, at_least
@@ -135,7 +135,9 @@ class Multi(_Several):
         except ValueError as error:  # of a worker, with its trace
             raise ValueError(str(error).partition("\n\nWorker traceback")[0]) from error
         except RuntimeError as error:
-            raise WorkerLost(str(error).partition("\n")[0], killed=False) from error
+            if "failed to initialize" not in str(error):
+                raise
+            raise WorkerLost(f"{str(error).partition('. ')[0]}.", killed=False) from error
         return Processes(collector, self.workers, plan.agent, plan.device)
 
 
@@ -190,6 +192,6 @@ class Ray(_Several):
             total_frames=sys.maxsize,
             init_random_frames=plan.random_frames,
             sync=True,
-            weight_sync_schemes={},  # workers are told by Worker.take
+            weight_updater=RemoteModuleWeightUpdater(),  # says that it is up to us: Worker.take
         )
         return Machines(collector, self.workers, plan.agent, plan.device)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -118,10 +119,11 @@ class Crew(ABC):
         Raises:
             ValueError: it is of another number of workers.
         """
-        workers = state.get("workers", {"0": state})
+        workers = dict(state.get("workers", {}))
         if len(workers) != self.workers:
-            raise ValueError(f"collector.workers is {len(workers)} there and {self.workers} here.")
-        arrays = tree_map_only(Tensor, lambda value: value.cpu().numpy(), dict(workers))
+            there = len(workers) or "no"
+            raise ValueError(f"collector has {there} workers there and {self.workers} here.")
+        arrays = tree_map_only(Tensor, lambda value: value.cpu().numpy(), workers)
         with self._watched():
             self.collector.map_fn("restore", [(arrays[str(i)],) for i in range(self.workers)])
         self.frames = state["frames"]
@@ -156,18 +158,19 @@ class Processes(Crew):
         self.collector.map_fn("take", [(self._shared,)] * self.workers)
 
     def lost(self) -> WorkerLost | None:
+        time.sleep(0.5)  # until the system has told
         for index, process in enumerate(self.collector.procs):
+            code = None
             with suppress(ValueError):  # TorchRL has closed it, which was one of the others
-                process.join(1.0)
                 code = process.exitcode
-                if code is None:
-                    continue
-                who = f"worker {index} of {self.workers}"
-                if code < 0:
-                    how = f"was killed by {signal.Signals(-code).name}"
-                    return WorkerLost(f"{who} {how}.", killed=True)
-                how = f"ended with status {code}, on a mistake or for taking longer than collector.patience"
-                return WorkerLost(f"{who} {how}; its trace stands above.", killed=False)
+            if code is None:
+                continue
+            who = f"worker {index} of {self.workers}"
+            if code < 0:
+                how = f"was killed by {signal.Signals(-code).name}"
+                return WorkerLost(f"{who} {how}.", killed=True)
+            how = f"ended with status {code}, on a mistake or for taking longer than collector.patience"
+            return WorkerLost(f"{who} {how}; its trace stands above.", killed=False)
         return None
 
     @property
@@ -192,9 +195,12 @@ class Machines(Crew):
         import ray
         import ray.exceptions
 
-        for index, worker in enumerate(self.collector.remote_collectors):
+        calls = [each.__ray_ready__.remote() for each in self.collector.remote_collectors]
+        answered, _ = ray.wait(calls, num_returns=len(calls), timeout=10.0)
+        for index, call in enumerate(calls):
             try:
-                ray.get(worker.__ray_ready__.remote(), timeout=10.0)
+                if call in answered:  # one that is gone does, too
+                    ray.get(call)
             except ray.exceptions.RayActorError as error:
                 how = " ".join(str(error).split())
                 return WorkerLost(f"worker {index} of {self.workers} is gone: {how}", killed=True)

@@ -231,3 +231,22 @@ def test_an_experiment_of_the_paper_sweeps_its_systems_and_seeds(name: str):
     }[name]
     assert swept.algo.split(",") == systems.split()
     assert swept.get("seed", "0,1,2,3,4") == "0,1,2,3,4"
+
+
+@pytest.mark.slow
+def test_a_sweep_on_a_cluster(command, tmp_path: Path):
+    """By submitit, which starts each job as on Slurm: folders, failures and repetitions are those of any other sweep."""
+    pytest.importorskip("submitit")
+    small = [setting for setting in SMALL if "batch_size" not in setting]
+    many = (*TRAIN, *small, "task=cart", "algo=sac", "out=many", "-m", "hydra/launcher=submitit_local")  # fmt: skip
+    with pytest.raises(SystemExit, match="^error: many/learning.batch_size-100000 failed; each"):
+        command(*many, "learning.batch_size=8,100000")
+    bad, good = (tmp_path / f"many/learning.batch_size-{size}" for size in (100000, 8))
+    assert "got 64 and 100000" in (bad / "error.txt").read_text()
+    made = (good / "evaluation/metrics.json").stat().st_mtime_ns
+    command(*many, "learning.batch_size=8,16")
+    assert (good / "evaluation/metrics.json").stat().st_mtime_ns == made
+    assert (tmp_path / "many/learning.batch_size-16/evaluation/metrics.json").is_file()
+    said = "".join(path.read_text() for path in tmp_path.glob("many/.submitit/*/*_log.out"))
+    assert said.count(f"{good} is there already") == 1
+    assert not list(tmp_path.glob(".failures-*"))

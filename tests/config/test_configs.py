@@ -72,7 +72,7 @@ def test_help_of_the_evaluation_lists_its_choices():
 def test_every_file_is_an_option_of_a_known_group():
     groups = {path.name for path in ROOT.iterdir() if path.is_dir()}
     assert groups == {
-        "algo", "cost_critic", "critic", "encoder", "env", "experiment", "hydra", "lagrange",
+        "algo", "collector", "cost_critic", "critic", "encoder", "env", "experiment", "hydra", "lagrange",
         "learning", "logger", "loss", "projector", "recipe", "risk", "shaping", "task",
         "transform",
     }  # fmt: skip

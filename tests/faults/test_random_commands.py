@@ -25,7 +25,13 @@ FEW = (*SMALL, "task.vehicles=1", "task.duration=2")
 CHOSEN = {group: sorted(options(group)) for group in GROUPS}
 #: What takes minutes, needs a package that may be missing, or another's service.
 LONG = {("experiment", name) for name in ("speed", "paper_ablation", "paper_comparison")}
-LONG |= {("logger", "wandb"), ("task", "gym"), ("env", "gym")}
+LONG |= {
+    ("logger", "wandb"),
+    ("task", "gym"),
+    ("env", "gym"),
+    ("collector", "multi"),
+    ("collector", "ray"),
+}
 EDGES = [
     "0",
     "1",
