@@ -32,8 +32,8 @@ GROUPS: dict[str, tuple[str, tuple[str, ...]]] = {
 
 def without(kind: str, names: tuple[str, ...]) -> list[str]:
     """What leaves these features out of all networks."""
-    scales = getattr(FORMS["route"], kind).items()
-    row = [BLANK if name in names else scale for name, scale in scales]
+    features = getattr(FORMS["route"], kind).items()
+    row = [BLANK if name in names else feature.scale for name, feature in features]
     setting = f"{kind}_scale={row}".replace(" ", "")
     return [f"+encoder.{setting}"]
 

@@ -1,4 +1,4 @@
-"""Reduce a run to its policy: ``python -m saferl.export checkpoint=RUN out=DIR``."""
+"""Turn a run into a policy for others: ``python -m saferl.export checkpoint=RUN out=DIR format=onnx``."""
 
 from saferl.cli.launch import launch
 

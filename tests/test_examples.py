@@ -18,8 +18,12 @@ SHORT = {
 }
 
 
+#: Needs an exported policy: tests/deploy/test_files.py runs it.
+ELSEWHERE = {"drive_onnx.py"}
+
+
 def test_every_example_is_tried():
-    assert {path.name for path in EXAMPLES.glob("*.py")} == set(SHORT)
+    assert {path.name for path in EXAMPLES.glob("*.py")} == set(SHORT) | ELSEWHERE
 
 
 @pytest.mark.parametrize("name", SHORT)

@@ -59,10 +59,11 @@ ROOMS = {
     "training": {"config", "checkpoint", "evaluation", "envs", "objectives", "modules"},
     "config": {"envs"},
     "algorithms": {"config", "training", "checkpoint", "envs", "objectives", "modules"},
-    "cli": {"config", "algorithms", "training", "evaluation", "checkpoint", "envs"},
+    "deploy": {"config", "algorithms", "checkpoint", "evaluation", "envs", "modules"},
+    "cli": {"config", "algorithms", "training", "evaluation", "checkpoint", "envs", "deploy"},
 }
 DOORS = {"__main__": "cli", "evaluate": "cli", "export": "cli", "summary": "evaluation"}
-DOORS |= {"catalog": "config"}
+DOORS |= {"catalog": "config", "tune": "cli"}
 
 
 def part(name: str) -> str:

@@ -100,3 +100,34 @@ def test_what_is_not_finite_is_refused_and_a_device_is_named():
     seen["ego"][0, 0] = torch.nan
     with pytest.raises(ValueError, match="an action that is not finite"):
         policy(seen)
+
+
+@pytest.mark.parametrize("name", ["arsac", "asac"])
+def test_no_state_and_a_locked_one(name: str):
+    """No state gives no action; what may not be written to stays as it is, and a copy has the action."""
+    seen = BatchedIntersection(SCENARIO, 2).reset(seeds=SCENARIO.episodes(0, 2))
+    policy = saferl.load_policy(name)
+    none = policy(seen[:0].clone())
+    assert all(none[key].shape[0] == 0 for key in policy.out_keys) and none["action"].shape == (
+        0,
+        2,
+    )
+    locked = seen.clone().lock_()
+    told = policy(locked)
+    assert set(locked.keys()) == set(seen.keys()) and not told.is_locked
+    torch.testing.assert_close(told["action"], policy(seen.clone())["action"])
+
+
+def test_another_action_is_corrected_as_its_own():
+    policy = saferl.load_policy("arsac")
+    policy.projector.limit = 0.0
+    seen = BatchedIntersection(SCENARIO, 8).reset(seeds=SCENARIO.episodes(11, 8))
+    own = policy(seen.clone())
+    state = {key: seen[key] for key in policy.in_keys}
+    result = policy.project(state, own["action_proposed"])
+    torch.testing.assert_close(result.action, own["action"])
+    for name in ("risk_before", "risk_after", "intervened", "feasible"):
+        torch.testing.assert_close(getattr(result, name), own[name].squeeze(-1))
+    assert result.steps.dtype is torch.int64 and result.intervened.any()
+    with pytest.raises(ValueError, match="no projector: load one with project=True"):
+        saferl.load_policy("arsac", project=False).project(state, own["action"])

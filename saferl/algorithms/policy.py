@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import torch
 from omegaconf import DictConfig
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from saferl.algorithms.assemble import load_agent
@@ -15,7 +17,18 @@ from saferl.algorithms.base import Agent, chain
 from saferl.checkpoint.run import progress, run_config
 from saferl.config.locate import pretrained_run, shipped
 from saferl.envs.transforms import Correction
+from saferl.modules import ProjectionResult
 from saferl.training.progress import Budget
+
+#: What a policy with a projector writes besides the action.
+REPORTED = {
+    "action_proposed": "the policy's own",
+    "risk_before": "of the proposed action, Q_c(s, a)",
+    "risk_after": "of the action",
+    "projection_steps": "that the correction took",
+    "intervened": "whether the two actions differ",
+    "feasible": "whether the risk of the action is within the limit",
+}
 
 
 class SafePolicy(TensorDictModuleBase):
@@ -30,7 +43,7 @@ class SafePolicy(TensorDictModuleBase):
 
     Reads what ``actor`` and the projector read. Writes ``action`` [*B, A], what is to be executed; with a projector
     also ``action_proposed`` [*B, A], ``risk_before``, ``risk_after`` [*B, 1], ``intervened`` [*B, 1] (bool) and what else
-    :class:`~saferl.envs.transforms.SafetyProjector` tells.
+    :class:`~saferl.envs.transforms.SafetyProjector` tells. Of a locked TensorDict it returns a copy with these entries.
 
     Raises:
         ValueError: in a step, an action is not finite.
@@ -67,6 +80,7 @@ class SafePolicy(TensorDictModuleBase):
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             seen = self.actor(tensordict.select(*self.in_keys))
         action = seen["action"]
+        tensordict = tensordict.copy() if tensordict.is_locked else tensordict
         if not action.isfinite().all():
             raise ValueError(
                 "the policy gave an action that is not finite; look at what it observes."
@@ -77,6 +91,39 @@ class SafePolicy(TensorDictModuleBase):
         tensordict.update(report.exclude("action_executed"))
         tensordict.set("action_proposed", action)
         return tensordict.set("action", report["action_executed"])
+
+    @torch.no_grad()
+    def project(self, state: Mapping[str, Tensor], action: Tensor) -> ProjectionResult:
+        """Another's action, corrected as the policy's own is: for a planner, or a loop of your own.
+
+        For a risk of your own see :func:`saferl.modules.project`.
+
+        Args:
+            state: what the policy observes, by its keys, [*B, ...].
+            action: [*B, A], in the policy's units.
+
+        Returns:
+            The action to execute, its risk and what else is to be known, tensors [*B] and [*B, A].
+
+        Raises:
+            ValueError: the policy has no projector.
+
+        >>> import saferl
+        >>> policy = saferl.load_policy("arsac")
+        >>> alone = {"ego": torch.zeros(5, 12), "vehicles": torch.zeros(5, 11, 12)}
+        >>> result = policy.project(alone, torch.zeros(5, 2))
+        >>> result.action.shape, result.feasible.shape
+        (torch.Size([5, 2]), torch.Size([5]))
+        """
+        if self.projector is None:
+            raise ValueError("this policy has no projector: load one with project=True.")
+        seen = TensorDict({**state, "action": action}, action.shape[:-1])
+        told = self.projector.correct(seen, **self.box)
+        rest = (told[name].squeeze(-1) for name in tuple(REPORTED)[1:])
+        before, after, steps, intervened, feasible = rest
+        return ProjectionResult(
+            told["action_executed"], before, after, steps.to(torch.int64), intervened, feasible
+        )
 
 
 def compiling(cfg: DictConfig, on: bool) -> DictConfig:

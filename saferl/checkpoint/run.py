@@ -213,23 +213,37 @@ def progress(path: Path) -> dict[str, int]:
     return {name: int(counted[name]) for name in ("frames", "episodes")}
 
 
-def export(path: Path, folder: Path) -> Path:
+def check_free(folder: Path) -> None:
+    """Refuse a folder that an exported policy would destroy.
+
+    Raises:
+        ValueError: it holds a run or a policy already.
+    """
+    held = any((folder / name).exists() for name in (FOLDER, "metrics.csv"))
+    if held or any(folder.glob("policy.*")):
+        raise ValueError(f"out: {folder} holds a run or a policy already; take another folder.")
+
+
+def export(path: Path, folder: Path, project: bool = True) -> Path:
     """Write what a trained policy needs as one file into a folder.
 
     Args:
         path: a run, a checkpoint in it, or a policy.
         folder: gets ``policy.safetensors``; ``checkpoint=`` and ``init=`` read it.
+        project: with its projector, if it was trained with one.
 
     Raises:
         FileNotFoundError: ``path`` holds no run or no checkpoint.
         ValueError: ``folder`` holds a run or a policy already.
     """
-    if any((folder / name).exists() for name in (FOLDER, "metrics.csv", EXPORTED)):
-        raise ValueError(f"out: {folder} holds a run or a policy already; take another folder.")
+    check_free(folder)
     found, loss = latest(path), _Held()
     if found.is_file():
         loss.state = policy_state(found)
     else:
         _load(sealed(loss=loss), found)
-    write_policy(folder, loss.state, run_config(path), progress(path))
+    cfg = run_config(path)
+    if not project:
+        cfg.projector = {"_target_": None}
+    write_policy(folder, loss.state, cfg, progress(path))
     return folder

@@ -89,7 +89,8 @@ def _of_another_kind(message: str, override: str) -> str | None:
 
 def _beside(key: str, config: str) -> list[str]:
     """The settings beside one of the root's, as far as they are known without composing."""
-    names = [field.name for field in fields(schema.Training if config == "config" else schema.Test)]
+    kinds = {"config": schema.Training, "evaluate": schema.Test, "export": schema.Export}
+    names = [field.name for field in fields(kinds[config])]
     return names if "." not in key else []
 
 

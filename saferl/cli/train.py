@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -24,38 +24,73 @@ from saferl.config.limits import check_limits
 from saferl.evaluation.compare import TESTED, side_by_side
 from saferl.evaluation.statistics import FIGURES, summarise
 from saferl.training.crew import WorkerLost
+from saferl.training.trainer import Trainer
 
 log = logging.getLogger(__name__)
 
 
 def train(cfg: DictConfig) -> None:
     """Train, or continue a run, then test the result."""
-    resuming = cfg.resume is not None
+    hydra = HydraConfig.get()
+    overrides = hydra.overrides.task
+    if cfg.resume is None:
+        train_into(Path(hydra.runtime.output_dir), cfg, overrides, job_folder() is not None)
+        return
+    run = run_folder(Path(str(cfg.resume)), "resume")
+    _work(prolonged(run_config(run), cfg, overrides), run, resuming=True)
+
+
+def train_into(
+    run: Path,
+    cfg: DictConfig,
+    overrides: Sequence[str],
+    repeated: bool = True,
+    prepare: Callable[[Trainer], None] = lambda trainer: None,
+) -> None:
+    """Train in a folder, then test the result.
+
+    Args:
+        run: the folder.
+        cfg: as composed, not resolved.
+        overrides: of the command line.
+        repeated: whether a run of this configuration that is there already goes on, or is left alone where it is finished.
+        prepare: is given the trainer before it begins.
+
+    Raises:
+        ValueError: the folder holds another run, or something in the configuration cannot be meant.
+        KeyboardInterrupt: after a checkpoint was left.
+    """
+    costs = complete(cfg.task).costs
+    check_limits(cfg, overrides, costs)
+    OmegaConf.resolve(cfg)
+    resuming = False
+    if repeated and (run / CONFIG).exists():
+        if begun(run):  # a sweep that is run again
+            resuming = composed(run_config(run)) == composed(cfg)
+        else:  # killed before its first checkpoint, if nobody works on it
+            with alone(run, "out"):
+                (run / CONFIG).unlink()
+    if resuming and (run / TESTED).exists():
+        log.info("%s is there already.", run)
+        return
     if not resuming:
-        run = Path(HydraConfig.get().runtime.output_dir)
-        costs = complete(cfg.task).costs
-        check_limits(cfg, HydraConfig.get().overrides.task, costs)
-        OmegaConf.resolve(cfg)
-        if job_folder() and (run / CONFIG).exists():
-            if begun(run):  # a sweep that is run again
-                resuming = composed(run_config(run)) == composed(cfg)
-            else:  # killed before its first checkpoint, if nobody works on it
-                with alone(run, "out"):
-                    (run / CONFIG).unlink()
-        if resuming and (run / TESTED).exists():
-            log.info("%s is there already.", run)
-            return
-        if not resuming:
-            claim(run, cfg)
-    else:
-        run = run_folder(Path(str(cfg.resume)), "resume")
-        cfg = prolonged(run_config(run), cfg, HydraConfig.get().overrides.task)
+        claim(run, cfg)
+    _work(cfg, run, resuming, prepare)
+
+
+def _work(
+    cfg: DictConfig,
+    run: Path,
+    resuming: bool,
+    prepare: Callable[[Trainer], None] = lambda trainer: None,
+) -> None:
+    """Train a run that is claimed, and test the result."""
     with alone(run, "resume" if resuming else "out"):
         for path in run.rglob("*"):
             if path.is_symlink():  # to write there would be to write elsewhere
                 raise ValueError(f"{path} is a link, which no run has.")
         try:
-            learn(cfg, run, resuming)
+            learn(cfg, run, resuming, prepare)
         finally:
             if not resuming and not begun(run):  # it never began
                 (run / CONFIG).unlink(missing_ok=True)
@@ -69,7 +104,7 @@ def train(cfg: DictConfig) -> None:
             ) from None
 
 
-def learn(cfg: DictConfig, run: Path, resuming: bool) -> None:
+def learn(cfg: DictConfig, run: Path, resuming: bool, prepare: Callable[[Trainer], None]) -> None:
     """Train to the end of the budget; where a worker is killed, go on from the newest checkpoint with new ones, which ends in
     the same bits.
 
@@ -79,7 +114,7 @@ def learn(cfg: DictConfig, run: Path, resuming: bool) -> None:
     lost_at = -1
     while True:
         try:
-            return _learn(cfg, run, resuming)
+            return _learn(cfg, run, resuming, prepare)
         except WorkerLost as lost:
             resuming = begun(run)
             saved = progress(run)["frames"] if resuming else -1
@@ -90,8 +125,9 @@ def learn(cfg: DictConfig, run: Path, resuming: bool) -> None:
             lost_at = saved
 
 
-def _learn(cfg: DictConfig, run: Path, resuming: bool) -> None:
+def _learn(cfg: DictConfig, run: Path, resuming: bool, prepare: Callable[[Trainer], None]) -> None:
     with closing(build_trainer(cfg, run)) as trainer:
+        prepare(trainer)
         if resuming:
             trainer.resume()
             if cfg != run_config(run):  # a larger budget, of which no test is there yet

@@ -13,77 +13,20 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
 
-ORDERS = ("joint", "sequential")
-DEVICES = ("auto", "cpu", "cuda")
-DRAWN = ("none", "all", "collisions", "frozen", "success")
-FORMATS = ("gif", "mp4", "png")
-TRACED = ("none", "collisions", "all")
-
-
-def at_least(least: float, settings: Any, *names: str, prefix: str = "") -> None:
-    """Refuse settings below ``least``, and those that are not finite; None passes."""
-    for name in names:
-        value = getattr(settings, name)
-        if value is not None and not least <= value < math.inf:
-            raise ValueError(f"{prefix}{name} must be >= {least}, got {value}.")
-
-
-def limits(settings: Any, *names: str) -> None:
-    """Refuse limits that are neither a finite number >= 0 nor several of them, in a list or by name; None passes."""
-    for name in names:
-        given = getattr(settings, name)
-        each = {} if given is None else {name: given}
-        if isinstance(given, dict):
-            each = {f"{name}.{key}": value for key, value in given.items()}
-        elif isinstance(given, list):
-            each = {f"{name}[{index}]": value for index, value in enumerate(given)}
-        for key, value in each.items():
-            if isinstance(value, bool) or not isinstance(value, (int, float)):
-                raise ValueError(f"{key} must be a number, got {value!r}.")
-            if not 0 <= value < math.inf:
-                raise ValueError(f"{key} must be >= 0, got {value}.")
-
-
-def above(least: float, settings: Any, *names: str, prefix: str = "") -> None:
-    """Refuse settings of ``least`` and below, and those that are not finite; None passes."""
-    for name in names:
-        value = getattr(settings, name)
-        if value is not None and not least < value < math.inf:
-            raise ValueError(f"{prefix}{name} must be > {least}, got {value}.")
-
-
-def share(settings: Any, *names: str, prefix: str = "") -> None:
-    """Refuse settings outside [0, 1]."""
-    for name in names:
-        value = getattr(settings, name)
-        if not 0 <= value <= 1:
-            raise ValueError(f"{prefix}{name} must be >= 0 and <= 1, got {value}.")
-
-
-def one_of(choices: tuple[str, ...], settings: Any, name: str, prefix: str = "") -> None:
-    """Refuse what is not among the choices."""
-    if getattr(settings, name) not in choices:
-        raise ValueError(
-            f"{prefix}{name} must be one of {', '.join(choices)}, got {getattr(settings, name)!r}."
-        )
-
-
-def drawing(settings: Any, prefix: str = "") -> None:
-    """Refuse pictures of no kind, and those that lack the package that makes them."""
-    one_of(DRAWN, settings, "draw", prefix)
-    at_least(1, settings, "draw_most", prefix=prefix)
-    one_of(FORMATS, settings, "draw_format", prefix)
-    if settings.draw_format == "mp4" and find_spec("imageio_ffmpeg") is None:
-        raise ValueError(
-            f"{prefix}draw_format=mp4 needs imageio-ffmpeg: pip install 'saferl[video]'."
-        )
-
-
-def seeded(settings: Any) -> None:
-    """Refuse a seed that an episode's cannot follow from."""
-    at_least(0, settings, "seed")
-    if settings.seed >= 2**31:
-        raise ValueError(f"seed must be < 2**31, got {settings.seed}.")
+from saferl.config.ranges import (
+    DEVICES,
+    EXPORTS,
+    OBSERVATIONS,
+    ORDERS,
+    TRACED,
+    above,
+    at_least,
+    drawing,
+    limits,
+    one_of,
+    seeded,
+    share,
+)
 
 
 @dataclass
@@ -322,6 +265,28 @@ class Test:
                 )
 
 
+@dataclass
+class Export:
+    """The configuration of an export."""
+
+    checkpoint: str | None = MISSING
+    pretrained: str | None = MISSING
+    out: str | None = MISSING
+    format: str = MISSING
+    project: bool = MISSING
+    observation: str = MISSING
+
+    def __post_init__(self):
+        one_of(tuple(EXPORTS), self, "format")
+        one_of(OBSERVATIONS, self, "observation")
+        if missing := [name for name in EXPORTS[self.format] if find_spec(name) is None]:
+            raise ValueError(
+                f"format={self.format} needs {', '.join(missing)}: pip install 'saferl[onnx]'."
+            )
+        if self.observation == "state" and self.format == "torch":
+            raise ValueError("observation=state is of format=pt2 or onnx, got format=torch.")
+
+
 def _known(node: DictConfig, path: str = "") -> None:
     """Refuse keys that were added to settings whose names are known."""
     kind: Any = OmegaConf.get_type(node)
@@ -343,11 +308,13 @@ def check(cfg: DictConfig) -> None:
         ValueError: names the key, the value and what is allowed.
     """
     kind = OmegaConf.get_type(cfg)
-    if kind not in (Training, Test):
+    if kind not in (Training, Test, Export):
         return
     _known(cfg)
     own = {f.name: cfg[f.name] for f in fields(kind) if f.default is MISSING}
     OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(kind), own))  # pyright: ignore
+    if kind is Export:
+        return
     num_envs = cfg.env.get("num_envs")
     if isinstance(num_envs, int) and num_envs < 1:
         raise ValueError(f"env.num_envs must be >= 1, got {num_envs}.")
@@ -363,5 +330,6 @@ def check(cfg: DictConfig) -> None:
 store = ConfigStore.instance()
 store.store("schema", Training)
 store.store("test_schema", Test)
+store.store("export_schema", Export)
 store.store("off_policy_schema", _OffPolicyNode, group="learning")
 store.store("on_policy_schema", _OnPolicyNode, group="learning")

@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from saferl.envs.ports import Feature, Port
 from saferl.envs.seeding import episode_seeds
 
 
@@ -47,6 +48,30 @@ class Task:
     def observed(self) -> Mapping[str, tuple[int, ...]]:
         """What a network may read of a step: keys, and their shapes without batch dimensions."""
         return {"observation": (self.size,)}
+
+    @property
+    def features(self) -> Mapping[str, Mapping[str, Feature]]:
+        """What is known of the numbers of what is observed and of ``action``, by key."""
+        return {}
+
+    @property
+    def ports(self) -> dict[str, Port]:
+        """What a policy may read, by key, and its ``action``."""
+        shapes = {**self.observed, "action": (self.action_dim,)}
+        return {
+            key: Port(("batch", *shape), self.features.get(key, {}))
+            for key, shape in shapes.items()
+        }
+
+    def from_state(self) -> Any:
+        """A function from tensors of the state to the entries of the observation, with ``ports`` that say what it reads.
+
+        Raises:
+            ValueError: the task observes its state itself.
+        """
+        raise ValueError(
+            f"observation=state is of the road, got task={self.task}: take observation=features."
+        )
 
     @property
     def network(self) -> Mapping[str, Any]:

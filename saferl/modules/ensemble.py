@@ -286,10 +286,11 @@ class CriticEnsemble(TensorDictModuleBase):
                 "the ensemble a list of critics, whose copies stay as they are."
             )
 
-    def bind(self, tensordict: TensorDictBase) -> BoundCritics:
+    def bind(self, tensordict: TensorDictBase, vmap: bool | None = None) -> BoundCritics:
         """The reduced value in these states as a function of the action alone, [*B, A] -> [*B, K].
 
         Reads the members' ``in_keys`` but for the action. It is valid until the parameters change.
+        ``vmap``: see :meth:`BoundCritics.of`.
         """
         self._stay_at_home(os.getpid())
         return BoundCritics.of(
@@ -299,6 +300,7 @@ class CriticEnsemble(TensorDictModuleBase):
             reduce=self.reduce,
             costs=self.costs,
             action_key=self.action_key,
+            vmap=vmap,
         )
 
     def values(self, tensordict: TensorDictBase) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -38,7 +38,7 @@ class ProjectionResult:
     feasible: Tensor
 
 
-class _Descent(NamedTuple):
+class Descent(NamedTuple):
     """Where each sample stands; all but the actions [*B, A] and the risks [*B, K] are [*B]."""
 
     action: Tensor
@@ -49,13 +49,40 @@ class _Descent(NamedTuple):
     safest: Tensor
     least: Tensor  # the risk of the safest action
 
+    @classmethod
+    def begin(
+        cls, action: Tensor, slope: Tensor, risk: Tensor, limit: Tensor, shift: Tensor
+    ) -> Descent:
+        """Before the first step, from the risks of the given action and the gradient of the worst."""
+        risky = worst(risk, shift) > limit
+        none = torch.zeros_like(risky, dtype=torch.int64)
+        return cls(action, slope, risk, risky, none, action, risk)
 
-def _worst(risk: Tensor, shift: Tensor) -> Tensor:
-    """The risk [*B] that exceeds its limit most, as if all had the least one: ``shift`` [K] is that minus theirs."""
+    def end(self, limit: Tensor, shift: Tensor, keep: str) -> tuple[Tensor, Tensor, Tensor]:
+        """The action to execute, its risks, and whether they are within their limits."""
+        action, risk = self.action, self.risk
+        if keep == "safest":
+            stuck = ~(worst(risk, shift) <= limit).unsqueeze(-1)  # NaN, too
+            action = torch.where(stuck, self.safest, action)
+            risk = torch.where(stuck, self.least, risk)
+        return action, risk, worst(risk, shift) <= limit
+
+
+def thresholds(limit: float | Sequence[float] | Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
+    """The least of K limits, and ``shift`` [K], how much that is below each: added to the risks, one limit serves all."""
+    limits = torch.as_tensor(limit, dtype=torch.float64).to(like).reshape(-1)
+    least = limits.amin()
+    return least, torch.where(
+        limits == least, 0.0, least - limits
+    )  # an infinite one limits nothing
+
+
+def worst(risk: Tensor, shift: Tensor) -> Tensor:
+    """The risk [*B] that exceeds its limit most, as if all had the least one."""
     return (risk + shift).amax(-1)
 
 
-def _evaluate(
+def evaluate(
     risk_fn: Callable[[Tensor], Tensor], action: Tensor, shift: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Risks [*B, K] of each action, and the gradient [*B, A] of the worst."""
@@ -73,14 +100,14 @@ def _evaluate(
             )
         if not risk.requires_grad:  # no action changes it
             return risk, torch.zeros_like(action)
-        worst = _worst(risk, shift).sum()
-        (slope,) = torch.autograd.grad(worst, action, materialize_grads=True)
+        most = worst(risk, shift).sum()
+        (slope,) = torch.autograd.grad(most, action, materialize_grads=True)
     return risk.detach(), slope
 
 
-def _descend(
+def descend(
     risk_fn: Callable[[Tensor], Tensor],
-    at: _Descent,
+    at: Descent,
     start: Tensor,
     limit: Tensor,
     shift: Tensor,
@@ -89,7 +116,7 @@ def _descend(
     penalty: float,
     low: float | Tensor,
     high: float | Tensor,
-) -> _Descent:
+) -> Descent:
     """Up to ``steps`` steps of the samples that are still active."""
     for _ in range(steps):
         # The gradient of the soft loss (E9), without components that point out of the box.
@@ -102,14 +129,14 @@ def _descend(
         scale = torch.where(active, step_size / norm, 0.0).unsqueeze(-1)
         moved = (at.action - scale * gradient).clamp(low, high)  # pyright: ignore
         action = torch.where(active.unsqueeze(-1), moved, at.action)
-        risk, slope = _evaluate(risk_fn, action, shift)
-        worst = _worst(risk, shift)
-        better = active & (worst < _worst(at.least, shift))
-        at = _Descent(
+        risk, slope = evaluate(risk_fn, action, shift)
+        most = worst(risk, shift)
+        better = active & (most < worst(at.least, shift))
+        at = Descent(
             action=action,
             slope=slope,
             risk=risk,
-            active=active & (worst > limit),
+            active=active & (most > limit),
             steps=at.steps + active,
             safest=torch.where(better.unsqueeze(-1), action, at.safest),
             least=torch.where(better.unsqueeze(-1), risk, at.least),
@@ -117,8 +144,8 @@ def _descend(
     return at
 
 
-_compiled_evaluate = Compiled(_evaluate, "the risk and its gradient", replay=False)
-_compiled_descend = Compiled(_descend, "the projection", replay=False)
+_compiled_evaluate = Compiled(evaluate, "the risk and its gradient", replay=False)
+_compiled_descend = Compiled(descend, "the projection", replay=False)
 
 
 def project(
@@ -195,32 +222,23 @@ def project(
     """
     _check_arguments(limit, steps, step_size, penalty, keep, low, high)
     start = action.detach()
-    limits = torch.as_tensor(limit, dtype=torch.float64).to(start).reshape(-1)
-    least = limits.amin()
-    shift = torch.where(limits == least, 0.0, least - limits)  # an infinite one limits nothing
-    evaluate, descend, together = _evaluate, _descend, 1
+    least, shift = thresholds(limit, start)
+    look, step, together = evaluate, descend, 1
     if compile:
         if not isinstance(risk_fn, BoundCritics):
             raise ValueError(f"compile=True needs BoundCritics as risk_fn, got {risk_fn!r}.")
-        evaluate, descend, together = _compiled_evaluate, _compiled_descend, _TOGETHER
-    risk_before, slope = evaluate(risk_fn, start, shift)
-    risky = _worst(risk_before, shift) > least
-    none = torch.zeros_like(risky, dtype=torch.int64)
-    at = _Descent(start, slope, risk_before, risky, none, start, risk_before)
+        look, step, together = _compiled_evaluate, _compiled_descend, _TOGETHER
+    risk_before, slope = look(risk_fn, start, shift)
+    at = Descent.begin(start, slope, risk_before, least, shift)
     for done in range(0, steps, together):
         # To ask a GPU would be to wait for it.
         if start.device.type == "cpu" and not at.active.any():
             break
         count = min(together, steps - done)
-        at = descend(risk_fn, at, start, least, shift, count, step_size, penalty, low, high)
+        at = step(risk_fn, at, start, least, shift, count, step_size, penalty, low, high)
 
-    current, risk_after = at.action, at.risk
-    if keep == "safest":
-        stuck = ~(_worst(risk_after, shift) <= least).unsqueeze(-1)  # NaN, too
-        current = torch.where(stuck, at.safest, current)
-        risk_after = torch.where(stuck, at.least, risk_after)
+    current, risk_after, feasible = at.end(least, shift, keep)
     intervened = (current != start).any(-1)
-    feasible = _worst(risk_after, shift) <= least
     risks = risk_before.squeeze(-1), risk_after.squeeze(-1)
     return ProjectionResult(current, *risks, at.steps, intervened, feasible)
 

@@ -22,6 +22,8 @@ from torchrl.envs import EnvBase
 from saferl.envs.intersection.collision_cost import CollisionCost
 from saferl.envs.intersection.costs import COSTS
 from saferl.envs.intersection.drivers import DRIVERS
+from saferl.envs.intersection.dynamics import ACTION_SCALE
+from saferl.envs.intersection.from_state import FromState
 from saferl.envs.intersection.geometry import ROUTES, ROUTES_OF_TASK, TASK_OF_ROUTE
 from saferl.envs.intersection.observation import FORMS, ROWS, Form, reading
 from saferl.envs.intersection.reward import Reward
@@ -29,6 +31,7 @@ from saferl.envs.intersection.roads import lanes
 from saferl.envs.intersection.spawning import SCENARIOS, Traffic, draw_route
 from saferl.envs.intersection.traffic import Vehicles, vehicle_states
 from saferl.envs.intersection.yielding import PERIOD
+from saferl.envs.ports import Feature
 from saferl.envs.seeding import ReplayedEnv, SeededEnv
 from saferl.envs.task import Task
 
@@ -174,6 +177,23 @@ class Scenario(Task):
     def observed(self) -> Mapping[str, tuple[int, ...]]:
         vehicles = (self.rows, len(self.form.vehicle))
         return {"ego": (len(self.form.ego),), "vehicles": vehicles, "route": (1,)}
+
+    @property
+    def features(self) -> Mapping[str, Mapping[str, Feature]]:
+        acceleration, steering = ACTION_SCALE
+        return {
+            "ego": self.form.ego,
+            "vehicles": self.form.vehicle,
+            "action": {
+                "acceleration": Feature(1.0, f"{acceleration:g} m/s^2", -1.0, 1.0),
+                "steering": Feature(
+                    1.0, f"{steering:g} rad", -1.0, 1.0, "front wheels, to the right"
+                ),
+            },
+        }
+
+    def from_state(self) -> FromState:
+        return FromState(self.rows, self.observation)
 
     @property
     def network(self) -> Mapping[str, Any]:

@@ -24,6 +24,7 @@ from saferl.envs.intersection.geometry import (
     target_points,
     wrap,
 )
+from saferl.envs.ports import Feature
 
 AHEAD = 70.0  # m along the ego's heading
 BEHIND = 30.0
@@ -42,53 +43,72 @@ _SEAM = 0.75 * math.pi
 
 @dataclass(frozen=True)
 class Form:
-    """The features of an observation with the fixed scales that a network divides them by.
+    """The features of an observation, with the fixed scales that a network divides them by.
 
     Attributes:
-        ego: of the ego, scale by name, in the feature's unit.
+        ego: of the ego, by name.
         vehicle: of a vehicle's row, likewise; the first says whether there is one.
     """
 
-    ego: dict[str, float]
-    vehicle: dict[str, float]
+    ego: dict[str, Feature]
+    vehicle: dict[str, Feature]
 
     @property
     def scales(self) -> dict[str, tuple[float, ...]]:
         """What the encoders of :mod:`saferl.modules` are given as ``ego_scale`` and ``vehicle_scale``."""
         return {
-            "ego_scale": tuple(self.ego.values()),
-            "vehicle_scale": tuple(self.vehicle.values()),
+            "ego_scale": tuple(each.scale for each in self.ego.values()),
+            "vehicle_scale": tuple(each.scale for each in self.vehicle.values()),
         }
 
 
+_V_X = Feature(10.0, "m/s", low=0.0, says="forwards")
+_V_Y = Feature(2.0, "m/s", says="to the right")
+_OMEGA = Feature(1.0, "rad/s", says="yaw rate, clockwise")
+_D_VEH = Feature(
+    20.0, "m", low=-2 * _RADIUS, says="gap to the nearest vehicle; 70 where none is seen"
+)
+_D_DES = Feature(50.0, "m", low=0.0, says="Manhattan distance to the nearer target point")
+_PRESENT = Feature(1.0, low=0.0, high=1.0, says="1 where the row is a vehicle, else all of it is 0")
 FORMS = {
     "route": Form(
         ego={
-            "v_x": 10.0, "v_y": 2.0, "omega": 1.0,  # m/s, m/s, rad/s
-            "offset": 2.0,  # m, to the right of its line
-            "heading": 0.5,  # rad, against the line's
-            "s": 20.0,  # m along the line, 0 at the box
-            **dict.fromkeys(ROUTES, 1.0),
-            "d_veh": 20.0, "d_des": 50.0,  # m
+            "v_x": _V_X, "v_y": _V_Y, "omega": _OMEGA,
+            "offset": Feature(2.0, "m", says="to the right of its line"),
+            "heading": Feature(0.5, "rad", -math.pi, math.pi, "against the line's"),
+            "s": Feature(20.0, "m", says="along the line, 0 at the box"),
+            **{name: Feature(1.0, low=0.0, high=1.0, says="whether this is its route") for name in ROUTES},
+            "d_veh": _D_VEH, "d_des": _D_DES,
         },
         vehicle={
-            "present": 1.0,
-            "x": 20.0, "y": 20.0,  # m ahead of the ego and to its right
-            "v_x": 10.0, "v_y": 10.0,  # m/s likewise, relative to the ego's
-            "sin": 1.0, "cos": 1.0,  # of its heading against the ego's
-            "conflict_s": 20.0,  # m along the ego's line to where its way first meets it
-            "conflict_t": 4.0,  # s until it is there
-            "lead": 4.0,  # s that the ego is there later
-            "closest": 10.0,  # m between both centres when they are closest, at their speeds and turns of now
-            "closest_t": 4.0,  # s until then
+            "present": _PRESENT,
+            "x": Feature(20.0, "m", -BEHIND, AHEAD, "ahead of the ego"),
+            "y": Feature(20.0, "m", says="to the ego's right"),
+            "v_x": Feature(10.0, "m/s", says="along the ego's heading, relative to the ego's"),
+            "v_y": Feature(10.0, "m/s", says="to the ego's right, likewise"),
+            "sin": Feature(1.0, "", -1.0, 1.0, "of its heading against the ego's"),
+            "cos": Feature(1.0, "", -1.0, 1.0, "likewise"),
+            "conflict_s": Feature(20.0, "m", 0.0, REACH, "along the ego's line to where its way first meets it"),
+            "conflict_t": Feature(4.0, "s", 0.0, PATIENCE, "until it is there"),
+            "lead": Feature(4.0, "s", -PATIENCE, PATIENCE, "that the ego is there later"),
+            "closest": Feature(10.0, "m", low=0.0, says="between both centres when they are closest, at their speeds and turns of now"),
+            "closest_t": Feature(4.0, "s", 0.0, HORIZON, "until then"),
         },
     ),
     "world": Form(
         ego={
-            "present": 1.0, "x": 10.0, "y": 10.0, "v_x": 10.0, "v_y": 2.0, "phi": 1.0, "omega": 1.0,
-            "d_veh": 20.0, "d_des": 50.0,
+            "present": Feature(1.0, low=1.0, high=1.0),
+            "x": Feature(10.0, "m", says="of the map, to the east"), "y": Feature(10.0, "m", says="of the map, to the south"),
+            "v_x": _V_X, "v_y": _V_Y,
+            "phi": Feature(1.0, "rad", says="heading, clockwise from x; not folded"),
+            "omega": _OMEGA, "d_veh": _D_VEH, "d_des": _D_DES,
         },
-        vehicle={"present": 1.0, "x": 20.0, "y": 20.0, "v_x": 10.0, "v_y": 10.0, "phi": 1.0},
+        vehicle={
+            "present": _PRESENT,
+            "x": Feature(20.0, "m", says="from the ego, along the map's x"), "y": Feature(20.0, "m", says="along its y"),
+            "v_x": Feature(10.0, "m/s", says="relative to the ego's, along the map's x"), "v_y": Feature(10.0, "m/s", says="along its y"),
+            "phi": Feature(1.0, "rad", -_SEAM, 2 * math.pi - _SEAM, "heading"),
+        },
     ),
 }  # fmt: skip
 _BY_WIDTH = {len(form.ego): form for form in FORMS.values()}
@@ -230,11 +250,10 @@ def observe(
 
     # The row of each vehicle: how many are nearer.
     distance = torch.where(seen, torch.hypot(dx, dy), torch.inf)
-    number = torch.arange(len(x), device=x.device).reshape(-1, *[1] * (x.ndim - 1))
+    number = torch.arange(x.shape[0], device=x.device).reshape(-1, *[1] * (x.ndim - 1))
     tie = (distance[None] == distance[:, None]) & (number[None] < number[:, None])
     row = ((distance[None] < distance[:, None]) | tie).sum(1)
-    count = min(rows - 1, len(x))
-    seen = seen & (row < count)
+    seen = seen & (row < rows - 1)
     observed = seen.movedim(0, -1)
     nearest = vehicle_distance(ego, vehicles, observed)
     target = destination_distance(ego, route)

@@ -1,0 +1,61 @@
+"""From places, headings and speeds of cars to what a policy observes of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from saferl.envs.intersection.geometry import ROUTES
+from saferl.envs.intersection.observation import ROWS, observe
+from saferl.envs.ports import Feature, Port
+
+_STATE = {
+    "x": Feature(20.0, "m", says="of the centre, to the east; the middle of the box is 0, 0"),
+    "y": Feature(20.0, "m", says="to the south"),
+    "v_x": Feature(10.0, "m/s", low=0.0, says="forwards"),
+    "v_y": Feature(2.0, "m/s", says="to the right"),
+    "phi": Feature(1.0, "rad", says="heading, clockwise from x; the ego comes at -pi / 2"),
+    "omega": Feature(1.0, "rad/s", says="yaw rate, clockwise"),
+}
+
+
+@dataclass(frozen=True)
+class FromState:
+    """:func:`observe` as a function of the state alone: for whoever has cars and no observation.
+
+    Attributes:
+        rows, form: see :func:`observe`.
+
+    Reads ``ego`` [B, 6] and ``vehicles`` [B, N, 6] (x, y, v_x, v_y, phi, omega in highway-env's frame: x to the right, y
+    down), absent rows NaN, N from 0; and ``route`` [B] int64, a row of :data:`ROUTES`. Returns ``ego`` [B, F] and
+    ``vehicles`` [B, M, G].
+
+    >>> ego, route = torch.tensor([[2.0, 55.0, 8.0, 0.0, -1.5708, 0.0]]), torch.tensor([1])
+    >>> alone = FromState()(ego, torch.full((1, 3, 6), torch.nan), route)
+    >>> alone["ego"].shape, int(alone["vehicles"].count_nonzero())
+    (torch.Size([1, 12]), 0)
+    """
+
+    rows: int = ROWS
+    form: str = "route"
+
+    ports: ClassVar[dict[str, Port]] = {
+        "ego": Port(("batch", 6), _STATE, says="the ego"),
+        "vehicles": Port(("batch", "vehicles", 6), _STATE, says="the others; NaN: no vehicle"),
+        "route": Port(
+            ("batch",),
+            dtype=torch.int64,
+            says=", ".join(f"{number}: {name}" for number, name in enumerate(ROUTES)),
+        ),
+    }
+
+    def __call__(self, ego: Tensor, vehicles: Tensor, route: Tensor) -> dict[str, Tensor]:
+        # One absent row more: not every runtime knows the largest of none.
+        vehicles = torch.cat([vehicles, torch.full_like(ego[:, None], torch.nan)], 1)
+        present = ~vehicles.isnan().any(-1)
+        others = torch.where(present[..., None], vehicles, 0.0)
+        own, table, _ = observe(ego, others, present, route, self.rows, self.form)
+        return {"ego": own, "vehicles": table}
