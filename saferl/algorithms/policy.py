@@ -51,6 +51,7 @@ class SafePolicy(TensorDictModuleBase):
     >>> import torch
     >>> from tensordict import TensorDict
     >>> from tensordict.nn import TensorDictModule
+    >>> from saferl.envs.transforms import SafetyProjector
     >>> actor = TensorDictModule(lambda x: x, ["x"], ["action"])
     >>> risk = TensorDictModule(lambda x, action: action, ["x", "action"], ["risk"])
     >>> policy = SafePolicy(actor, SafetyProjector(risk, limit=0.5))

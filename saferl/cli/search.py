@@ -16,8 +16,8 @@ from tensordict import TensorDictBase
 from saferl.algorithms.assemble import build_agent, complete
 from saferl.checkpoint.lock import alone
 from saferl.cli.errors import MISTAKES, explain
+from saferl.cli.settings import command, compose
 from saferl.cli.train import train_into
-from saferl.cli.tune import command, compose
 from saferl.config.check import check
 from saferl.config.limits import check_limits
 from saferl.config.space import Dimension

@@ -10,19 +10,15 @@ from __future__ import annotations
 
 import argparse
 import logging
-import shlex
 import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-import hydra
-from omegaconf import DictConfig
-
 from saferl.cli.errors import MISTAKES, explain
 from saferl.cli.launch import INTERRUPTED
+from saferl.cli.settings import compose
 from saferl.config import schema
-from saferl.config.locate import config_dir
 from saferl.config.machine import check_machine
 from saferl.config.space import Dimension, split
 
@@ -61,12 +57,6 @@ def main(arguments: list[str] | None = None) -> None:
         raise SystemExit(INTERRUPTED) from None
 
 
-def compose(overrides: Sequence[str]) -> DictConfig:
-    """The configuration of a training."""
-    with hydra.initialize_config_dir(config_dir(), version_base="1.3"):
-        return hydra.compose("config", list(overrides))
-
-
 def checked(settings: Sequence[str], trials: int) -> tuple[list[str], list[Dimension]]:
     """What is fixed and what is searched, each end of it as it would be trained.
 
@@ -89,8 +79,3 @@ def checked(settings: Sequence[str], trials: int) -> tuple[list[str], list[Dimen
             schema.check(cfg)
             check_machine(cfg)
     return fixed, space
-
-
-def command(overrides: Sequence[str]) -> str:
-    """How one trains with these settings."""
-    return shlex.join(["python", "-m", "saferl", *overrides])

@@ -29,7 +29,7 @@ PARTS = {
     "loss": "torchrl.objectives.LossModule",
     "lagrange.multiplier": "saferl.modules.LagrangeMultiplier",
     "lagrange.signal": "saferl.training.signals.Signal",
-    "projector": "torchrl.envs.Transform",
+    "projector": "saferl.envs.transforms.Correction",
     "transform": "saferl.envs.transforms.Saute",
     "collector": "saferl.training.collectors.Collecting",
     "logger.sinks": "torchrl.record.loggers.Logger",

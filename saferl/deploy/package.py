@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDict
 
-import saferl
 from saferl.algorithms.parts import make
 from saferl.algorithms.policy import REPORTED, SafePolicy, load_policy
 from saferl.checkpoint.run import progress, run_config
@@ -43,7 +43,7 @@ def package(
     policy = load_policy(source, project=project)
     ports = observe.ports if observe else {key: task.ports[key] for key in policy.in_keys}
     about = {
-        "saferl": saferl.__version__,
+        "saferl": version("saferl"),
         "algo": cfg.algo_name,
         "observation": observation,
         "trained": {"seed": cfg.seed, **progress(source)},

@@ -66,7 +66,7 @@ def test_no_file_is_pickled(run: Path, tmp_path: Path, monkeypatch: pytest.Monke
 def test_everything_is_in_it(run: Path):
     """A peer's checkpoint held the actor alone (docs/pitfalls.md, 13)."""
     assert set(Checkpoint.manifest(latest(run))["components"]) == {
-        "buffer", "clock", "collector", "files", "loss", "optimizer", "progress", "record", "rng", "watch",
+        "buffer", "clock", "collector", "files", "loss", "means", "optimizer", "progress", "rng", "watch",
         "watchdog", "best",
         "window",
     }  # fmt: skip

@@ -20,6 +20,8 @@ from saferl.modules import MLP
 PLACES = {name.rpartition(".")[2]: name for name in PARTS}
 PLACES |= {"risk": "loss.risk", "reward": "task.reward", "cost": "task.cost"}
 PLACES |= {"activation": "encoder.activation"}
+#: Parts of a part that not every composition has, and what is Hydra's.
+WITHIN = ("prediction", "fallbacks", "hydra")
 
 
 def targets() -> dict[str, set[str]]:
@@ -28,7 +30,8 @@ def targets() -> dict[str, set[str]]:
 
     def walk(node: Any, makes: str) -> None:
         for key, value in node.items() if isinstance(node, dict) else ():
-            walk(value, key)
+            if key not in WITHIN:
+                walk(value, key)
         for each in node if isinstance(node, list) else ():
             walk(each, makes)
         if isinstance(node, dict) and node.get("_target_"):

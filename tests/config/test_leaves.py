@@ -75,13 +75,14 @@ def test_every_leaf_is_read_by_a_training(
     if task in ("cart", "gym") and cfg.task.get("reward"):
         pytest.skip("refused: a shaped reward is the road's")
     unread = {name for name, keys in readers(cfg).items() if not keys} - {"cost_limit"}
-    assemble.complete(cfg.task)
+    task_of_this = assemble.complete(cfg.task)
     check(cfg)
     names, seen = watched(cfg)
     assert not seen
     # What has been checked reads everything, and so shows nothing.
-    monkeypatch.setattr(assemble, "complete", lambda node: None)
+    monkeypatch.setattr(assemble, "complete", lambda node: task_of_this)
     monkeypatch.setattr(assemble, "check", lambda cfg: None)
+    monkeypatch.setattr(assemble, "order_limits", lambda cfg, costs: None)
     trainer = assemble.build_trainer(cfg, tmp_path)
     trainer.train()
     closing_test(cfg, tmp_path)

@@ -325,8 +325,9 @@ def test_trainer_refuses(name: str, value: int, tmp_path: Path):
 
 def test_two_runs_that_start_at_once_do_not_share_a_folder(refusal, monkeypatch, tmp_path: Path):
     def complete(node):
-        assemble.complete(node)
+        task = assemble.complete(node)
         commands.claim(tmp_path / "run", OmegaConf.create({"seed": 7}))  # faster by a moment
+        return task
 
     monkeypatch.setattr(commands, "complete", complete)
     line = refusal("train", "config", *SMALL, *EMPTY, "algo=sac", "out=run")
