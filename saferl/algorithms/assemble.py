@@ -10,7 +10,7 @@ from typing import Any, get_type_hints
 
 import hydra
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torchrl.envs import EnvBase, RewardSum, Transform, TransformedEnv
 from torchrl.envs.transforms import Compose
 
@@ -120,13 +120,14 @@ def seat(cfg: DictConfig, agent: Agent, num_envs: int, seed: int) -> Seat:
     return Seat(env, algorithm.behaviour(agent.actor, env), agent.take)
 
 
-def worker_seat(settings: dict[str, Any], index: int, workers: int) -> Seat:
-    """The seat of a worker, which is built in its process from plain settings, on the CPU.
+def worker_seat(cfg: DictConfig, index: int, workers: int) -> Seat:
+    """The seat of a worker, which is built in its process from a run's configuration, on the CPU.
 
     Its episodes and its random numbers are those of no other worker and no other seed.
     """
     torch.set_num_threads(1)  # a core each
-    cfg = OmegaConf.create(settings | {"device": "cpu"})
+    cfg = cfg.copy()
+    cfg.device = "cpu"
     torch.manual_seed(cfg.seed)
     agent = build_agent(cfg)  # begins as the learner's
     seed = int(mix(torch.tensor(cfg.seed), index + 1) & U31)
@@ -203,12 +204,11 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
     agent = algorithm.agent(parts)
     if cfg.init and not begun(run):  # a run that goes on has its own networks
         begin_from(agent, algorithm.architecture(parts), Path(cfg.init), cfg.device)
-    settings: Any = OmegaConf.to_container(cfg, resolve=True)
     plan = Plan(
         agent,
         parts.device,
         own=partial(seat, cfg, agent, num_envs, cfg.seed),
-        seat=partial(worker_seat, settings),
+        seat=partial(worker_seat, cfg),
         num_envs=num_envs,
         decisions=algorithm.decisions(num_envs),
         random_frames=0 if cfg.init else algorithm.random_frames(),

@@ -50,8 +50,8 @@ class Candidate:
         """
         agent = trained_agent(cfg, path)
         projects = project and agent.projector is not None
-        settings: Any = OmegaConf.to_container(cfg)
-        about = {"cost_limit": settings["cost_limit"]}
+        limit: Any = cfg.cost_limit
+        about = {"cost_limit": OmegaConf.to_object(limit) if OmegaConf.is_config(limit) else limit}
         origin = {"algo": cfg.algo_name, "training_seed": cfg.seed}
         if not project and agent.projector is not None:
             origin["algo"] += " unprojected"

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from omegaconf import OmegaConf
 from small import EMPTY, SMALL, compose
 from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -31,9 +30,8 @@ LATE = ("algo=rsac", "projector.start=0.5", "projector.limit=-1", "projector.ste
 
 def worker(index: int, *options: str, workers: int = 2) -> Worker:
     """A worker in this process."""
-    settings = OmegaConf.to_container(compose(*SMALL, *EMPTY, *options), resolve=True)
     return Worker(
-        partial(worker_seat, settings, workers=workers),
+        partial(worker_seat, compose(*SMALL, *EMPTY, *options), workers=workers),
         create_env_kwargs={"index": index},
         patience=60.0,
         frames_per_batch=8,
