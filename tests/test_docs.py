@@ -20,6 +20,7 @@ from small import EMPTY, SMALL, compose
 
 from saferl.algorithms.assemble import build_agent, complete
 from saferl.cli.arguments import readable
+from saferl.cli.tune import main as tune
 from saferl.config import schema
 from saferl.config.catalog import main as catalog
 from saferl.config.check import check
@@ -113,6 +114,11 @@ def saferl(command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         if door in TABLES:
             TABLES[door](arguments)
             return
+        if door == "tune":  # composed, checked and built, each end of each range; no trial
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr("saferl.cli.search.Search.run", lambda self, trials, seeds: None)
+                tune(arguments)
+            return
         assert module == "saferl" or door in ("evaluate", "export"), module
         door, config = ("train", "config") if module == "saferl" else (door, door)
         if "--help" in arguments:
@@ -144,8 +150,8 @@ def is_read(arguments: list[str], later: str | None) -> bool:
 
 def smaller(door: str, arguments: list[str]) -> list[str]:
     """A command line with a small budget, one seed, in this process; the road gives way to other tasks and backends."""
-    if door == "export":
-        return arguments
+    if door == "export":  # attention and a projector take long to write down as a graph
+        return [re.sub("^pretrained=arsac$", "pretrained=sac_lag", a) for a in arguments]
     if any(argument.startswith("resume=") for argument in arguments):
         return [re.sub(r"^frames=.*", "frames=32", argument) for argument in arguments]
     arguments = [re.sub(r"^(seed=\d+),.*", r"\1", argument) for argument in arguments]

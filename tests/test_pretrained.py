@@ -120,7 +120,7 @@ def test_no_state_and_a_locked_one(name: str):
 
 def test_another_action_is_corrected_as_its_own():
     policy = saferl.load_policy("arsac")
-    policy.projector.limit = 0.0
+    policy.projector._limit.fill_(0.0)
     seen = BatchedIntersection(SCENARIO, 8).reset(seeds=SCENARIO.episodes(11, 8))
     own = policy(seen.clone())
     state = {key: seen[key] for key in policy.in_keys}
@@ -129,5 +129,5 @@ def test_another_action_is_corrected_as_its_own():
     for name in ("risk_before", "risk_after", "intervened", "feasible"):
         torch.testing.assert_close(getattr(result, name), own[name].squeeze(-1))
     assert result.steps.dtype is torch.int64 and result.intervened.any()
-    with pytest.raises(ValueError, match="no projector: load one with project=True"):
+    with pytest.raises(ValueError, match="needs a policy with a SafetyProjector, got none"):
         saferl.load_policy("arsac", project=False).project(state, own["action"])

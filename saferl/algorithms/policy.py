@@ -16,7 +16,7 @@ from saferl.algorithms.assemble import load_agent
 from saferl.algorithms.base import Agent, chain
 from saferl.checkpoint.run import progress, run_config
 from saferl.config.locate import pretrained_run, shipped
-from saferl.envs.transforms import Correction
+from saferl.envs.transforms import Correction, SafetyProjector
 from saferl.modules import ProjectionResult
 from saferl.training.progress import Budget
 
@@ -107,7 +107,7 @@ class SafePolicy(TensorDictModuleBase):
             The action to execute, its risk and what else is to be known, tensors [*B] and [*B, A].
 
         Raises:
-            ValueError: the policy has no projector.
+            ValueError: the policy has no projector along the gradient of a risk.
 
         >>> import saferl
         >>> policy = saferl.load_policy("arsac")
@@ -116,8 +116,9 @@ class SafePolicy(TensorDictModuleBase):
         >>> result.action.shape, result.feasible.shape
         (torch.Size([5, 2]), torch.Size([5]))
         """
-        if self.projector is None:
-            raise ValueError("this policy has no projector: load one with project=True.")
+        if not isinstance(self.projector, SafetyProjector):
+            got = "none" if self.projector is None else type(self.projector).__name__
+            raise ValueError(f"project needs a policy with a SafetyProjector, got {got}.")
         seen = TensorDict({**state, "action": action}, action.shape[:-1])
         told = self.projector.correct(seen, **self.box)
         rest = (told[name].squeeze(-1) for name in tuple(REPORTED)[1:])

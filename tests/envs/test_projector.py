@@ -263,7 +263,7 @@ def test_settings_are_checked_at_once():
 def test_several_risks_each_have_their_limit(shape):
     """Each coordinate of the action is a risk; corrected where either passes its limit, and told apart."""
     risk = TensorDictModule(lambda _, action: action[..., :2], ["observation", "action"], ["risk"])
-    both = SafetyProjector(risk, [0.2, 0.6], penalty=10.0)
+    both = SafetyProjector(risk, [0.2, 0.6], penalty=10.0, steps=100)
     env = TransformedEnv(EchoEnv(shape), both)
     check_env_specs(env)
     env.set_seed(0)
