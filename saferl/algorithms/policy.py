@@ -79,7 +79,10 @@ class SafePolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            seen = self.actor(tensordict.select(*self.in_keys))
+            given = tensordict.select(*self.in_keys)
+            # A distribution knows no probability of no action.
+            seen = self.actor(given if given.numel() else given.new_zeros(1))
+            seen = seen if given.numel() else seen[:0].reshape(given.batch_size)
         action = seen["action"]
         tensordict = tensordict.copy() if tensordict.is_locked else tensordict
         if not action.isfinite().all():
