@@ -78,11 +78,12 @@ class SafePolicy(TensorDictModuleBase):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if not tensordict.batch_size.numel():  # distributions and critics want one state
+            one = self.forward(tensordict.select(*self.in_keys).new_zeros(1))
+            none = one[:0].reshape(tensordict.batch_size)
+            return (tensordict.copy() if tensordict.is_locked else tensordict).update(none)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            given = tensordict.select(*self.in_keys)
-            # A distribution knows no probability of no action.
-            seen = self.actor(given if given.numel() else given.new_zeros(1))
-            seen = seen if given.numel() else seen[:0].reshape(given.batch_size)
+            seen = self.actor(tensordict.select(*self.in_keys))
         action = seen["action"]
         tensordict = tensordict.copy() if tensordict.is_locked else tensordict
         if not action.isfinite().all():
