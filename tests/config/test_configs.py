@@ -114,7 +114,13 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("option", [o for o in OPTIONS if not o.startswith("algo=")])
+#: What starts processes, which tests/training does.
+STARTING = ("collector=multi", "collector=ray")
+
+
+@pytest.mark.parametrize(
+    "option", [o for o in OPTIONS if not o.startswith("algo=") and o not in STARTING]
+)
 def test_option_builds_or_is_refused_with_the_reason(option: str, tmp_path: Path):
     """Each option of each group, one at a time, in place of ARSAC's own."""
     cfg = compose(*SMALL, option, *BESIDE.get(option, ()))
