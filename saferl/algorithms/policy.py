@@ -79,7 +79,7 @@ class SafePolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         if not tensordict.batch_size.numel():  # distributions and critics want one state
-            one = self.forward(tensordict.select(*self.in_keys).new_zeros(1))
+            one = self.forward(tensordict.select(*self.in_keys).new_zeros(torch.Size([1])))
             none = one[:0].reshape(tensordict.batch_size)
             return (tensordict.copy() if tensordict.is_locked else tensordict).update(none)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
