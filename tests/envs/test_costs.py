@@ -59,7 +59,7 @@ def test_a_cost_among_several_is_what_it_is_alone(backend):
     found = {names: rollout(env, 8) for names, env in envs.items()}
     assert found[NAMES]["cost"].shape == (8, 2, 4) and found[("cost",)]["cost"].shape == (8, 2, 1)
     each = found[NAMES]["cost"]
-    assert torch.equal(each[..., 2:3], found[("comfort",)]["cost"])
+    torch.testing.assert_close(each[..., 2:3], found[("comfort",)]["cost"])
     torch.testing.assert_close(each[..., :2].sum(-1, keepdim=True), found[("cost",)]["cost"])
     assert (each[..., 2:] >= 0).all() and (each[..., 2] > 0).any()
 

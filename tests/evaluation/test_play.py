@@ -247,7 +247,7 @@ def test_a_test_draws_episodes_by_their_numbers(tmp_path: Path, command):
 def test_without_its_package_an_mp4_is_refused_with_the_command_that_installs_it(
     refusal, monkeypatch, tmp_path: Path
 ):
-    monkeypatch.setattr("saferl.config.schema.find_spec", lambda name: None)
+    monkeypatch.setattr("saferl.config.ranges.find_spec", lambda name: None)
     line = refusal("evaluate", "evaluate", "policy=blind", "draw=all", "draw_format=mp4")
     assert line.endswith("draw_format=mp4 needs imageio-ffmpeg: pip install 'saferl[video]'.")
     line = refusal("train", "config", "evaluation.draw_format=mp4")

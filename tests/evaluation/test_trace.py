@@ -234,6 +234,8 @@ def test_a_warning_is_the_first_within_five_seconds():
 
         def bind(self, data):
             class Bound:
+                costs = 1
+
                 def values(self, action):
                     return torch.full((2, len(action), 1), 0.3)
 

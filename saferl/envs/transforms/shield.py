@@ -71,7 +71,7 @@ class Shield(Correction):
         >>> from saferl.envs.intersection import BatchedIntersection, Scenario
         >>> from saferl.envs.intersection.drivers import Driver
         >>> from saferl.envs.transforms import Shield
-        >>> road = BatchedIntersection(Scenario(task="gs").as_test(), num_envs=4, seed=1)
+        >>> road = BatchedIntersection(Scenario(task="gs").as_test(), num_envs=4, seed=2)
         >>> data = TransformedEnv(road, Shield()).rollout(60, Driver())  # blind to traffic
         >>> bool(data["next", "intervened"].any()), bool(data["next", "collision"].any())
         (True, False)
