@@ -24,10 +24,10 @@ from saferl.algorithms.policy import compiling, trained_agent
 from saferl.checkpoint.run import run_config
 from saferl.cli.evaluate import on_its_own_task
 from saferl.config.locate import config_dir
-from saferl.envs.intersection.base import Scenario
 from saferl.envs.intersection.comparison import save_comparison
 from saferl.envs.intersection.drivers import DRIVERS
 from saferl.envs.intersection.episode import Episode, record
+from saferl.envs.intersection.scenario import Scenario
 
 LOOKED_AT = 50  # episodes
 

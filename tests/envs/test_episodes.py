@@ -16,7 +16,6 @@ from batch import (
     step,
 )
 
-from saferl.envs.intersection.base import Scenario
 from saferl.envs.intersection.geometry import (
     ROUTES,
     ROUTES_OF_TASK,
@@ -24,6 +23,7 @@ from saferl.envs.intersection.geometry import (
     project,
     reference_lines,
 )
+from saferl.envs.intersection.scenario import Scenario
 from saferl.envs.intersection.spawning import (
     draw_route,
     draw_start,

@@ -19,12 +19,13 @@ from torchrl.envs import ParallelEnv
 from torchrl.envs.utils import check_env_specs
 
 from saferl.envs.intersection import BatchedIntersection, Scenario
-from saferl.envs.intersection.base import OUTCOMES, SUBSTEPS
+from saferl.envs.intersection.base import OUTCOMES
 from saferl.envs.intersection.drivers import Driver
 from saferl.envs.intersection.dynamics import step_ego, to_physical
 from saferl.envs.intersection.geometry import ARM, LENGTH, overlap
 from saferl.envs.intersection.observation import observe
 from saferl.envs.intersection.roads import MOVEMENTS, lane_frames, lanes
+from saferl.envs.intersection.scenario import SUBSTEPS
 from saferl.envs.intersection.sumo import SumoIntersection, installed, placed
 from saferl.envs.intersection.sumo_net import MANNERS, network
 from saferl.envs.seeding import episode_seeds

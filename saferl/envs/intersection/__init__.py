@@ -6,11 +6,12 @@ The batched road stands alone; highway-env is imported with the first use of wha
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from saferl.envs.intersection.base import IntersectionBase, Scenario
+from saferl.envs.intersection.base import IntersectionBase
 from saferl.envs.intersection.batched import BatchedIntersection
 from saferl.envs.intersection.collision_cost import CollisionCost
 from saferl.envs.intersection.registration import register
 from saferl.envs.intersection.reward import Reward
+from saferl.envs.intersection.scenario import Scenario
 from saferl.envs.intersection.spawning import SCENARIOS, Traffic
 from saferl.envs.intersection.sumo import SumoIntersection
 

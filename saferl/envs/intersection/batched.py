@@ -10,18 +10,13 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from saferl.envs.intersection.base import (
-    OUTCOMES,
-    STANDING,
-    SUBSTEPS,
-    IntersectionBase,
-    Scenario,
-)
+from saferl.envs.intersection.base import OUTCOMES, IntersectionBase
 from saferl.envs.intersection.costs import Decision, costs_of
 from saferl.envs.intersection.dynamics import step_ego, to_physical
 from saferl.envs.intersection.geometry import arrived, columns, frame, offroad, separation
 from saferl.envs.intersection.observation import observe
 from saferl.envs.intersection.roads import Lanes, lane_frames, lanes, pairs, zones
+from saferl.envs.intersection.scenario import STANDING, SUBSTEPS, Scenario
 from saferl.envs.intersection.spawning import draw_route, draw_start, draw_traffic, sense
 from saferl.envs.intersection.traffic import (
     Vehicles,

@@ -10,7 +10,6 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from saferl.envs.intersection.base import STANDING, SUBSTEPS, Scenario
 from saferl.envs.intersection.batched import (
     BatchedIntersection,
     State,
@@ -29,6 +28,7 @@ from saferl.envs.intersection.geometry import (
 )
 from saferl.envs.intersection.observation import as_world
 from saferl.envs.intersection.roads import SPEED_LIMIT
+from saferl.envs.intersection.scenario import STANDING, SUBSTEPS, Scenario
 
 _STILL = 1e-3  # m, by which a gap may change between two cars that stand
 _REST = 0.05  # m/s; an ego that creeps faster than this is not taken to stand

@@ -11,7 +11,6 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-from saferl.envs.intersection.base import STANDING, SUBSTEPS, Scenario, build
 from saferl.envs.intersection.collision_cost import CollisionCost
 from saferl.envs.intersection.costs import Decision, costs_of
 from saferl.envs.intersection.dynamics import to_physical
@@ -28,6 +27,7 @@ from saferl.envs.intersection.observation import ROWS, observe
 from saferl.envs.intersection.regulation import IntersectionRoad
 from saferl.envs.intersection.rendering import Renderer
 from saferl.envs.intersection.reward import Reward
+from saferl.envs.intersection.scenario import STANDING, SUBSTEPS, Scenario, build
 from saferl.envs.intersection.spawning import (
     Traffic,
     draw_route,

@@ -8,9 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from saferl.envs.intersection.base import OUTCOMES, ReplayedIntersection, Scenario
+from saferl.envs.intersection.base import OUTCOMES, ReplayedIntersection
 from saferl.envs.intersection.geometry import ROUTES
 from saferl.envs.intersection.highway import IntersectionEnv
+from saferl.envs.intersection.scenario import Scenario
 from saferl.envs.intersection.traffic import Vehicles
 
 

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from saferl.envs.intersection.base import OUTCOMES, SUBSTEPS, ReplayedIntersection, Scenario
+from saferl.envs.intersection.base import OUTCOMES, ReplayedIntersection
 from saferl.envs.intersection.batched import (
     State,
     TensorIntersection,
@@ -32,6 +32,7 @@ from saferl.envs.intersection.batched import (
 from saferl.envs.intersection.dynamics import step_ego, to_physical
 from saferl.envs.intersection.geometry import ARM, LENGTH
 from saferl.envs.intersection.roads import MOVEMENTS, lane_project, lanes
+from saferl.envs.intersection.scenario import SUBSTEPS, Scenario
 from saferl.envs.intersection.sumo_net import MANNERS, network, traffic
 from saferl.envs.intersection.sumo_worker import Car, Pose, Seen
 from saferl.envs.intersection.traffic import Vehicles
