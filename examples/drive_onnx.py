@@ -1,19 +1,19 @@
 """Drive highway-env's own intersection by an exported policy, with onnxruntime and neither saferl nor torch.
 
 python -m saferl.export pretrained=arsac out=policy format=onnx observation=state
-python examples/drive_onnx.py policy/policy.onnx --episodes 20
+python examples/drive_onnx.py policy/policy.onnx 20
 """
 
-import argparse
+import sys
 
 import gymnasium
 import highway_env  # noqa: F401
 import numpy as np
 import onnxruntime
 
-STRAIGHT_ON = 1  # the file's metadata lists the routes
+STRAIGHT_ON = np.array([1])  # the file's metadata lists the routes
 ACTION = {"type": "ContinuousAction", "acceleration_range": (-5, 5), "steering_range": (-0.6, 0.6)}
-CONFIG = {"action": {**ACTION, "dynamical": True}, "destination": "o2"}
+CONFIG = {"action": {**ACTION, "dynamical": True}, "destination": "o2", "duration": 25}
 CONFIG |= {"policy_frequency": 10, "simulation_frequency": 30}
 
 
@@ -24,23 +24,16 @@ def state(car) -> list[float]:
     return [*car.position, car.speed, getattr(car, "lateral_speed", 0.0), car.heading, omega]
 
 
-parser = argparse.ArgumentParser()
-parser.add_argument("policy", help="policy.onnx, with observation=state")
-parser.add_argument("--episodes", type=int, default=20)
-parser.add_argument("--seconds", type=int, default=25, help="that an episode may last")
-options = parser.parse_args()
-session = onnxruntime.InferenceSession(options.policy)
-env, ends = gymnasium.make("intersection-v1", config={**CONFIG, "duration": options.seconds}), []
-for seed in range(options.episodes):
+session = onnxruntime.InferenceSession(sys.argv[1])
+env, ends = gymnasium.make("intersection-v1", config=CONFIG), []
+for seed in range(int(sys.argv[2])):
     env.reset(seed=seed)
-    ended = False
-    while not ended:
+    terminated = truncated = False
+    while not (terminated or truncated):
         ego, cars = env.unwrapped.vehicle, env.unwrapped.road.vehicles
         others = np.reshape([state(car) for car in cars if car is not ego], (1, -1, 6))
-        seen = {"ego": [state(ego)], "vehicles": others}
-        seen = {key: np.asarray(value, np.float32) for key, value in seen.items()}
-        (action,) = session.run(["action"], {**seen, "route": np.array([STRAIGHT_ON])})
+        seen = {"ego": np.float32([state(ego)]), "vehicles": others.astype(np.float32)}
+        (action,) = session.run(["action"], {**seen, "route": STRAIGHT_ON})
         *_, terminated, truncated, info = env.step(action[0])
-        ended = terminated or truncated
     ends.append("crashed" if info["crashed"] else "arrived" if terminated else "waiting")
 print({end: ends.count(end) for end in sorted(set(ends))})

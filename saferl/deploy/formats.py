@@ -66,6 +66,13 @@ def write_onnx(program: ExportedProgram, file: Path, about: Mapping[str, Any]) -
             output_names=list(about["outputs"]),
         )
     model: Any = written.model  # pyright: ignore
+    names = {
+        dim.value: name
+        for given, port in zip(model.graph.inputs, about["inputs"].values(), strict=True)
+        for dim, name in zip(given.shape, port["shape"], strict=True)
+        if isinstance(name, str)
+    }
+    written.rename_axes(names)  # pyright: ignore  (torch calls them s42)
     for part in (model.graph, *model.functions.values()):  # where each node came from, in paths
         for node in part.all_nodes():
             node.metadata_props.clear()

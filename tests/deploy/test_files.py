@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import onnxruntime
 import pytest
 import torch
 from tensordict import TensorDict
@@ -81,6 +82,9 @@ def test_a_file_and_its_card_say_what_goes_in(small: Path, from_state: Path):
     _, about = read_onnx(from_state)
     assert list(about["inputs"]) == ["ego", "vehicles", "route"]
     assert about["inputs"]["vehicles"]["shape"] == ["batch", "vehicles", 6]
+    session = onnxruntime.InferenceSession(from_state)
+    shapes = {each.name: each.shape for each in (*session.get_inputs(), *session.get_outputs())}
+    assert shapes["vehicles"] == ["batch", "vehicles", 6] and shapes["action"] == ["batch", 2]
     units = {each["name"]: each["unit"] for each in about["inputs"]["ego"]["features"]}
     assert units == {"x": "m", "y": "m", "v_x": "m/s", "v_y": "m/s", "phi": "rad", "omega": "rad/s"}
     action = about["outputs"]["action"]["features"]
@@ -96,7 +100,7 @@ def test_a_file_and_its_card_say_what_goes_in(small: Path, from_state: Path):
 def test_the_example_needs_neither_torch_nor_saferl(from_state: Path):
     code = f"""
 import runpy, sys
-sys.argv = ["drive", {str(from_state)!r}, "--episodes", "1", "--seconds", "1"]
+sys.argv = ["drive", {str(from_state)!r}, "1"]
 runpy.run_path({str(ROOT / "examples" / "drive_onnx.py")!r})
 print(sorted({{"torch", "saferl", "tensordict"}} & set(sys.modules)))
 """
