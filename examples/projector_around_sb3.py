@@ -35,7 +35,9 @@ options = parser.parse_args()
 torch.manual_seed(0)
 torch.set_num_threads(1)
 
-theirs = PPO("MultiInputPolicy", gymnasium.make("saferl/Intersection-GS-v0"), seed=0, device="cpu")
+road = gymnasium.make("saferl/Intersection-GS-v0")
+rollout = min(2048, options.steps)
+theirs = PPO("MultiInputPolicy", road, n_steps=rollout, seed=0, device="cpu")
 theirs.learn(options.steps)
 
 

@@ -149,18 +149,24 @@ def is_read(arguments: list[str], later: str | None) -> bool:
 
 
 def smaller(door: str, arguments: list[str]) -> list[str]:
-    """A command line with a small budget, one seed, in this process; the road gives way to other tasks and backends."""
+    """A command line with a small budget, one seed, the ends of each choice, in this process; the road gives way to other
+    tasks and backends."""
     if door == "export":  # attention and a projector take long to write down as a graph
         return [re.sub("^pretrained=arsac$", "pretrained=sac_lag", a) for a in arguments]
     if any(argument.startswith("resume=") for argument in arguments):
         return [re.sub(r"^frames=.*", "frames=32", argument) for argument in arguments]
     arguments = [re.sub(r"^(seed=\d+),.*", r"\1", argument) for argument in arguments]
+    arguments = [re.sub(r"^([\w.]+=\w+),.*,(\w+)$", r"\1,\2", argument) for argument in arguments]
     names = {argument.partition("=")[0] for argument in arguments}
     fewer = next((FEWER[a] for a in arguments if a in FEWER), ())
     arguments += [each for each in fewer if each.partition("=")[0] not in names]
-    small = (*EMPTY, *(SMALL if door == "train" else ("episodes=2", "draw=none")))
+    small = (
+        *EMPTY,
+        "task.duration=5",
+        *(SMALL if door == "train" else ("episodes=2", "draw=none")),
+    )
     other = any(re.match(r"(task|experiment)=(gym|cart|tank)", a) for a in arguments)
-    kept = {"env", "task.vehicles"} if other else {"env"} & names
+    kept = {"env", "task.vehicles", "task.duration"} if other else {"env"} & names
     small = tuple(a for a in small if a.partition("=")[0] not in kept)
     replaced = {a.partition("=")[0] for a in small}
     arguments = [a for a in arguments if not a.startswith(("hydra/launcher", "hydra.launcher."))]

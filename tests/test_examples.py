@@ -12,7 +12,7 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 SHORT = {
     "cost_loss.py": (["--updates", "30"], ["return -", "(best -1.119), cost ", "(limit 0.2)"]),
     "projector_around_sb3.py": (
-        ["--steps", "1", "--updates", "20", "--episodes", "4"],
+        ["--steps", "64", "--updates", "20", "--episodes", "4"],
         ["PPO of Stable-Baselines3, alone", "with the projector", "intervention"],
     ),
 }

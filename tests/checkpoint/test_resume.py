@@ -64,7 +64,14 @@ def test_resume_does_not_need_the_run_that_it_began_from(tmp_path: Path):
     assert_same(everything(restored(second, *options)), everything(trained))
 
 
-@pytest.mark.parametrize("algo", ["sac", "arsac", "ppo_lag"])
+@pytest.mark.parametrize(
+    "algo",
+    [
+        "arsac",
+        pytest.param("sac", marks=pytest.mark.slow),
+        pytest.param("ppo_lag", marks=pytest.mark.slow),
+    ],
+)
 def test_killed_and_resumed_equals_uninterrupted(algo: str, tmp_path: Path, spawn):
     """SIGKILL in mid-episode on highway-env with traffic, a projector at work in ``arsac``."""
     options = [*SMALL, *TRAFFIC, f"algo={algo}", "frames=48", "save_every=4"]
