@@ -5,7 +5,7 @@ STAMP := $(VENV)/.installed
 # One thread for each process: two that fight over the cores are slower than one.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: setup train demo test slow lint docs gpu generalisation
+.PHONY: setup train demo test slow lint docs gpu generalisation results
 
 setup: $(STAMP)
 
@@ -45,6 +45,12 @@ generalisation: setup
 	test -n "$(RUN)" || { echo "Give RUN=FOLDER, or several, RUN=A,B."; exit 1; }
 	$(BIN)/python -m saferl.evaluate -m policy=scripted,blind $(CONDITIONS)
 	$(BIN)/python -m saferl.evaluate -m checkpoint=$(RUN) project=true,false $(CONDITIONS)
+
+# The tables of docs/results/comparison.md, from the numbers of finished runs beside it.
+results: setup
+	$(BIN)/python -m saferl.report docs/results/numbers --out build/results
+	sed "1s/.*/# The paper's comparison/" build/results/report.md > docs/results/comparison.md
+	cp build/results/curves.png docs/results
 
 lint: setup
 	$(BIN)/ruff check . && $(BIN)/ruff format --check . && $(BIN)/pyright

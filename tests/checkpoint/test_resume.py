@@ -109,7 +109,7 @@ def test_killed_and_resumed_equals_uninterrupted(algo: str, tmp_path: Path, spaw
 @pytest.mark.parametrize(
     ("algo", "vehicles", "scenario"),
     [
-        ("sac_lag", 0, "nominal"),
+        pytest.param("sac_lag", 0, "nominal", marks=pytest.mark.slow),
         ("rsac", 5, "dense"),
         ("ppo_lag", 0, "dense"),
         ("cpo", 0, "nominal"),
@@ -217,7 +217,7 @@ def events(run: Path, key: str) -> list[tuple[int, float]]:
     return [(event.step, event.value) for event in shown.Scalars(key)]
 
 
-@pytest.mark.parametrize("save_every", [12, 1000])
+@pytest.mark.parametrize("save_every", [pytest.param(12, marks=pytest.mark.slow), 1000])
 def test_tensorboard_shows_a_resumed_run_once(save_every: int, tmp_path: Path):
     """What came after the checkpoint is hidden, even where that was before the first row."""
     options = [*SMALL, *EMPTY, "algo=sac", "logger=tensorboard", f"save_every={save_every}"]

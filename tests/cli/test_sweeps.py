@@ -140,16 +140,12 @@ def test_one_refused_job_of_a_sweep_stops_no_other(command, tmp_path: Path, caps
 @pytest.mark.parametrize(
     "name",
     [
-        "Läufe",
-        "run (1)",
+        "Läufe (1) 50%",
         "algo=rsac,seed=0",
-        "50%",
-        "a{b}",
-        "it's",
+        "a{b} it's #c",
         "ends\\",
         "007",
         "true",
-        "a b#c",
     ],
 )
 def test_a_path_may_hold_any_character(name: str, command, tmp_path: Path):

@@ -25,6 +25,8 @@ TASKS = {
     "cart": ("task=cart", "encoder=mlp", *LIMITS),
     "gym": ("task=gym", "task.id=Pendulum-v1", "task.cost_key=null", "encoder=mlp", *LIMITS),
 }
+#: One of either family, on every task; the others on one.
+FEW = ("rsac", "ppo_lag")
 #: Read before a run is built: by Hydra, for its folder, and by the command.
 EARLIER = {"out", "resume"}
 
@@ -66,8 +68,14 @@ def watched(cfg: DictConfig) -> tuple[set[str], set[str]]:
     return set(values), seen
 
 
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("algo", ALGOS)
+@pytest.mark.parametrize(
+    ("algo", "task"),
+    [
+        pytest.param(algo, task, marks=[] if task == "batched" or algo in FEW else pytest.mark.slow)
+        for algo in ALGOS
+        for task in TASKS
+    ],
+)
 def test_every_leaf_is_read_by_a_training(
     algo: str, task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

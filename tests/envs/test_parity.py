@@ -254,9 +254,14 @@ def test_the_road_of_objects_goes_on_as_the_rules_in_numpy_do(seed):
 # --- whole episodes ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("observation", FORMS)
-@pytest.mark.parametrize("name", list(SCENARIOS))
-@pytest.mark.parametrize("task", ["lt", "gs", "rt"])
+@pytest.mark.parametrize(
+    ("task", "name", "observation"),
+    [
+        *(("gs", name, "route") for name in SCENARIOS),
+        *((task, "noisy", form) for task in ("lt", "rt") for form in FORMS),
+        ("gs", "nominal", "world"),
+    ],
+)
 def test_an_episode_is_the_same_on_both_backends(task, name, observation):
     """Observation, reward, cost and ends, decision by decision, at the rates of training and test."""
     frequency = 10 if task == "gs" else 5

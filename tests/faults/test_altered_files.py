@@ -84,7 +84,7 @@ def alter(folder: Path, how: str, chance: random.Random) -> str:
     return path.relative_to(folder).as_posix()
 
 
-@pytest.mark.parametrize("count", [60, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [30, pytest.param(1000, marks=pytest.mark.slow)])
 def test_each_alteration_is_refused_or_changes_nothing(
     trainer: Trainer, tmp_path: Path, count: int
 ):

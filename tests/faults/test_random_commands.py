@@ -112,7 +112,7 @@ def run(line: list[str]) -> None:
 CHECKS = [HealthCheck.too_slow, HealthCheck.data_too_large]
 
 
-@settings(max_examples=8, deadline=None, suppress_health_check=CHECKS, derandomize=True)
+@settings(max_examples=5, deadline=None, suppress_health_check=CHECKS, derandomize=True)
 @given(LINES)
 def test_a_random_command_line_trains_or_is_refused(line: list[str]):
     run(line)

@@ -149,6 +149,7 @@ def test_a_killed_worker_is_survived(command, forked, tmp_path: Path, monkeypatc
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "killed" / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_a_worker_that_hangs_is_named(command, forked, monkeypatch, capfd):
     """It ends, and says where it was; the run ends with one line, and goes on where it was."""
     mother, step, left = os.getpid(), BatchedIntersection._step, [3]
