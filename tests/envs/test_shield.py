@@ -37,8 +37,8 @@ def scene(y: float, speed: float, *others: tuple[float, float, float, float]) ->
     return TensorDict(seen | {"action": GO[None]}, [1])
 
 
-def lasts(seen: TensorDict, driver, first=None, horizon: float = 5.0) -> float:
-    prediction = ConstantVelocity()
+def lasts(seen: TensorDict, driver, first=None, horizon: float = 5.0, **settings: float) -> float:
+    prediction = ConstantVelocity(**settings)
     start = prediction.begin(seen, None, ROAD)
     return safe_for(prediction, ROAD, start, driver, horizon, first).item()
 
@@ -87,6 +87,19 @@ def test_who_comes_from_behind_or_can_stop_is_trusted_to():
     assert lasts(across((-28.0, 2.0, 9.0, 0.0)), Brake()) == math.inf
     # 6 m before the ego's flank at 9 m/s: 13.5 m/s^2.
     assert lasts(across((-7.5, 2.0, 9.0, 0.0)), Brake()) == pytest.approx(0.8)
+
+
+def test_who_drives_ahead_may_brake_at_any_time():
+    """10 m behind at 8 m/s: it stands after 6.4 m, so that its tail is reached after 16.4 / 8 = 2.05 s."""
+    ahead = scene(60.0, 8.0, (2.0, 45.0, 8.0, -math.pi / 2))
+    assert lasts(ahead, Hold()) == pytest.approx(2.2)  # the end of a decision of 0.2 s
+    assert lasts(ahead, Hold(), ahead=0.0) == math.inf
+    assert lasts(ahead, Brake()) == math.inf
+    # The gap shrinks by t^2 where it brakes with 2 m/s^2, for 4 s: by 10 m after 3.16 s.
+    assert lasts(ahead, Hold(), ahead=2.0) == pytest.approx(3.2)
+    # Who comes towards it goes on.
+    oncoming = scene(60.0, 8.0, (2.0, 0.0, 8.0, math.pi / 2))
+    assert lasts(oncoming, Hold()) == lasts(oncoming, Hold(), ahead=0.0) == pytest.approx(3.6)
 
 
 def test_where_nobody_can_be_saved_the_last_to_crash_drives():

@@ -78,7 +78,8 @@ class Prediction:
 
 
 class ConstantVelocity(Prediction):
-    """Everybody observed goes straight on as fast as now. It knows what the policy sees, and no more.
+    """Everybody observed goes straight on as fast as now, but for who drives ahead of the ego its way: he brakes to a stand from
+    now on, as he may. It knows what the policy sees, and no more.
 
     Nobody would go on like that into a car that stands in the way or brakes ahead, so two kinds of contact are taken to be
     avoided by the other: with a car that is behind the ego and drives its way, and of an ego at rest with a car that has time
@@ -86,10 +87,11 @@ class ConstantVelocity(Prediction):
 
     Args:
         braking: with how much such a car is trusted to stop, m/s^2.
+        ahead: with how much a car ahead is taken to brake, m/s^2; 0: it does not.
     """
 
-    def __init__(self, braking: float = 3.0):
-        self.braking = braking
+    def __init__(self, braking: float = 3.0, ahead: float = 5.0):
+        self.braking, self.ahead = braking, ahead
 
     def begin(self, seen: TensorDictBase, env: Any, scenario: Scenario) -> State:
         own, table = as_world(seen["ego"], seen["vehicles"])
@@ -97,8 +99,9 @@ class ConstantVelocity(Prediction):
         cos, sin = torch.cos(ego[:, 4]), torch.sin(ego[:, 4])
         v_x, v_y = ego[:, 2] * cos - ego[:, 3] * sin, ego[:, 2] * sin + ego[:, 3] * cos
         there, dx, dy, dv_x, dv_y, heading = table.unbind(-1)
-        behind = dx * cos[:, None] + dy * sin[:, None] < -LENGTH / 2
-        follows = behind & (torch.cos(heading - ego[:, None, 4]) > _ALONG)
+        along = dx * cos[:, None] + dy * sin[:, None]
+        same_way = torch.cos(heading - ego[:, None, 4]) > _ALONG
+        follows, leads = (same_way & (side * along > LENGTH / 2) for side in (-1, 1))
         return {
             "ego": ego,
             "route": seen["route"].squeeze(-1),
@@ -108,6 +111,7 @@ class ConstantVelocity(Prediction):
             "v_x": v_x[:, None] + dv_x,
             "v_y": v_y[:, None] + dv_y,
             "heading": heading,
+            "slows": self.ahead * leads,
             "time": torch.zeros_like(v_x),
         }
 
@@ -126,18 +130,23 @@ class ConstantVelocity(Prediction):
             ego = step_ego(ego, control, dt)
             moments.append(ego)
         passed = dt * torch.arange(1, SUBSTEPS + 1, dtype=ego.dtype, device=ego.device)
-        x = scene["x"] + scene["v_x"] * passed[:, None, None]  # [3, R, N]
-        y = scene["y"] + scene["v_y"] * passed[:, None, None]
+        speed, slows = torch.hypot(scene["v_x"], scene["v_y"]), scene["slows"]
+        until = torch.where(slows > 0, speed / slows, torch.inf).clamp(min=_STILL)  # s, it stands
+        moves = torch.minimum(passed[:, None, None], until)  # [3, R, N]
+        moves = moves * (1 - moves / (2 * until))  # s at this speed, of the same way
+        x, y = scene["x"] + scene["v_x"] * moves, scene["y"] + scene["v_y"] * moves
+        left = (1 - passed[-1] / until).clamp(min=0.0)
         at = torch.stack(moments)[:, :, None]
         mine, theirs = frame(*at[..., [0, 1, 4]].unbind(-1)), frame(x, y, scene["heading"])
-        speed = torch.hypot(scene["v_x"], scene["v_y"])
         time = scene["time"] + passed[:, None]
         sees = (at[..., 2] < _REST) & (speed > STANDING)
         stops = sees & (speed <= 2 * self.braking * time[..., None])
         counts = scene["there"] & ~stops
         gaps = torch.where(counts, separation(mine, theirs), torch.inf)
         gap = _least(gaps.movedim(0, 1).flatten(1))
-        return scene | {"ego": ego, "x": x[-1], "y": y[-1], "time": time[-1]}, gap
+        after = {"ego": ego, "x": x[-1], "y": y[-1], "time": time[-1]}
+        after |= {"v_x": scene["v_x"] * left, "v_y": scene["v_y"] * left}
+        return scene | after, gap
 
     def settled(self, scenario: Scenario, scene: State, gap: Tensor) -> Tensor:
         speed = torch.hypot(scene["v_x"], scene["v_y"])
