@@ -23,7 +23,7 @@ _ABOUT = "saferl.json"
 @contextmanager
 def _quietly():
     """Without what torch's exporters say of themselves."""
-    loggers = [logging.getLogger(name) for name in ("onnxscript", "onnx_ir")]
+    loggers = [logging.getLogger(name) for name in ("onnxscript", "onnx_ir", "torch.onnx")]
     before = [logger.level for logger in loggers]
     for logger in loggers:
         logger.setLevel(logging.ERROR)

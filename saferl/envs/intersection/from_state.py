@@ -30,7 +30,7 @@ class FromState:
         rows, form: see :func:`observe`.
 
     Reads ``ego`` [B, 6] and ``vehicles`` [B, N, 6] (x, y, v_x, v_y, phi, omega in highway-env's frame: x to the right, y
-    down), absent rows NaN, N from 0; and ``route`` [B] int64, a row of :data:`ROUTES`. Returns ``ego`` [B, F] and
+    down), absent rows NaN throughout, N from 0; and ``route`` [B] int64, a row of :data:`ROUTES`. Returns ``ego`` [B, F] and
     ``vehicles`` [B, M, G].
 
     >>> ego, route = torch.tensor([[2.0, 55.0, 8.0, 0.0, -1.5708, 0.0]]), torch.tensor([1])
@@ -44,7 +44,9 @@ class FromState:
 
     ports: ClassVar[dict[str, Port]] = {
         "ego": Port(("batch", 6), _STATE, says="the ego"),
-        "vehicles": Port(("batch", "vehicles", 6), _STATE, says="the others; NaN: no vehicle"),
+        "vehicles": Port(
+            ("batch", "vehicles", 6), _STATE, says="the others; a row of NaN: no vehicle"
+        ),
         "route": Port(
             ("batch",),
             dtype=torch.int64,
@@ -55,7 +57,10 @@ class FromState:
     def __call__(self, ego: Tensor, vehicles: Tensor, route: Tensor) -> dict[str, Tensor]:
         # One absent row more: not every runtime knows the largest of none.
         vehicles = torch.cat([vehicles, torch.full_like(ego[:, None], torch.nan)], 1)
-        present = ~vehicles.isnan().any(-1)
+        unknown = vehicles.isnan()
+        present = ~unknown.any(-1)
         others = torch.where(present[..., None], vehicles, 0.0)
         own, table, _ = observe(ego, others, present, route, self.rows, self.form)
-        return {"ego": own, "vehicles": table}
+        # A car of which only a part is known must not seem to be absent.
+        partly = (unknown.any(-1) & ~unknown.all(-1)).any(-1, keepdim=True)
+        return {"ego": torch.where(partly, torch.nan, own), "vehicles": table}
