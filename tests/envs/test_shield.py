@@ -254,7 +254,9 @@ def test_behind_a_projector_it_has_the_last_word():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"fallbacks": {}}, "fallbacks must be one driver at least"),
+        ({"fallbacks": {}}, "fallbacks must be drivers by name, one at least"),
+        ({"fallbacks": [Brake()]}, "fallbacks must be drivers by name, one at least"),
+        ({"fallbacks": {"crawl": torch.nn.ReLU()}}, "fallbacks.crawl must be a TensorDictModule"),
         ({"horizon": 0.0}, "horizon must be > 0, got 0.0"),
         ({"frequency": -1}, "frequency must be > 0, got -1"),
         ({"margin": -0.1}, r"margin must be >= 0, got -0.1"),
@@ -263,6 +265,13 @@ def test_behind_a_projector_it_has_the_last_word():
 def test_settings_are_refused(options, message: str):
     with pytest.raises(ValueError, match=message):
         Shield(**options)
+
+
+def test_a_fallback_that_gives_no_number_is_named():
+    """Nothing is nearer than the margin where it is NaN, so that it would seem safe."""
+    bad = TensorDictModule(lambda ego: ego[..., :2] * math.nan, ["ego"], ["action"])
+    with pytest.raises(ValueError, match="the fallback bad: an action is not finite"):
+        Shield(fallbacks={"bad": bad}).correct(scene(60.0, 8.0))
 
 
 @pytest.mark.parametrize(

@@ -263,6 +263,8 @@ def safe_for(
         action, how = first, scenario
         if time or action is None:
             action, how = driver(watched(prediction, scene))["action"], after
+        if not action.isfinite().all():  # every comparison below would call it safe
+            raise ValueError("an action is not finite.")
         time += 1 / how.policy_frequency
         scene, gap = prediction.step(how, scene, to_physical(action))
         ego = scene["ego"]

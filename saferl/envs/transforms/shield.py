@@ -62,7 +62,7 @@ class Shield(Correction):
     else the number of the fallback that drives, from 1.
 
     Raises:
-        ValueError: no fallback, ``horizon`` or ``frequency`` not above 0, ``margin`` below 0; in a step, an environment that is no intersection, or
+        ValueError: no fallback, or one that is no TensorDictModule, ``horizon`` or ``frequency`` not above 0, ``margin`` below 0; in a step, an environment that is no intersection, or
             not the batched one for the simulator's prediction.
 
     Examples:
@@ -95,8 +95,13 @@ class Shield(Correction):
                 "cautious": CautiousDriver(),
                 "go": Driver(),
             }
-        if not fallbacks:
-            raise ValueError("fallbacks must be one driver at least, got none.")
+        if not fallbacks or not isinstance(fallbacks, Mapping):
+            raise ValueError(f"fallbacks must be drivers by name, one at least, got {fallbacks!r}.")
+        for key, driver in fallbacks.items():
+            if not isinstance(driver, TensorDictModuleBase):
+                raise ValueError(
+                    f"fallbacks.{key} must be a TensorDictModule that writes action, got {driver!r}."
+                )
         for key, value in (("horizon", horizon), ("frequency", frequency)):
             if value is not None and value <= 0:
                 raise ValueError(f"{key} must be > 0, got {value}.")
@@ -175,9 +180,12 @@ class Shield(Correction):
             """Until when a fallback is safe in some of the scenes."""
             driver: Any = self.fallbacks[number]
             part = pick(scene, those)
-            return safe_for(
-                self.prediction, scenario, part, driver, self.horizon, first, self.margin
-            )
+            try:
+                return safe_for(
+                    self.prediction, scenario, part, driver, self.horizon, first, self.margin
+                )
+            except ValueError as error:
+                raise ValueError(f"Shield: the fallback {self.names[number]}: {error}") from error
 
         which = torch.zeros(len(action), dtype=torch.int64, device=action.device)
         executed, safe = action.clone(), which == 0
