@@ -131,3 +131,9 @@ def test_another_action_is_corrected_as_its_own():
     assert result.steps.dtype is torch.int64 and result.intervened.any()
     with pytest.raises(ValueError, match="needs a policy with a SafetyProjector, got none"):
         saferl.load_policy("arsac", project=False).project(state, own["action"])
+    unknown = {key: value * torch.nan for key, value in state.items()}
+    for seen, action in ((unknown, own["action"]), (state, own["action"] * torch.nan)):
+        with pytest.raises(ValueError, match="is not finite"):
+            policy.project(seen, action)
+    with torch.inference_mode(), pytest.raises(RuntimeError, match="no_grad, not inference_mode"):
+        policy.project(state, own["action"])

@@ -111,7 +111,7 @@ class SafePolicy(TensorDictModuleBase):
             The action to execute, its risk and what else is to be known, tensors [*B] and [*B, A].
 
         Raises:
-            ValueError: the policy has no projector along the gradient of a risk.
+            ValueError: the policy has no projector along the gradient of a risk; an action or a risk is not finite.
 
         >>> import saferl
         >>> policy = saferl.load_policy("arsac")
@@ -125,6 +125,10 @@ class SafePolicy(TensorDictModuleBase):
             raise ValueError(f"project needs a policy with a SafetyProjector, got {got}.")
         seen = TensorDict({**state, "action": action}, action.shape[:-1])
         told = self.projector.correct(seen, **self.box)
+        if not (action.isfinite().all() and told["risk_before"].isfinite().all()):
+            raise ValueError(
+                "project needs numbers: the action, or the risk of the state, is not finite."
+            )
         rest = (told[name].squeeze(-1) for name in tuple(REPORTED)[1:])
         before, after, steps, intervened, feasible = rest
         return ProjectionResult(

@@ -192,6 +192,10 @@ class SafetyProjector(Correction):
         Returns:
             The entries that a step writes under ``next``, [*B].
         """
+        if torch.is_inference_mode_enabled():  # also where no state happens to be risky
+            raise RuntimeError(
+                "the projector needs gradients: use torch.no_grad, not inference_mode."
+            )
         inputs = tensordict.select(*self.risk.in_keys).reshape(-1)
         action = inputs.get(self.action_key)
 
