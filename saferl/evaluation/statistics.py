@@ -156,14 +156,14 @@ def verdict(mean: float, low: float | None, cost_limit: float, name: str = "cost
     """Whether a mean cost keeps its limit, which is called ``name``, as far as its interval tells.
 
     >>> verdict(4.9, 4.5, 5), verdict(5.2, 4.9, 5), verdict(5.2, None, 5), verdict(5.3, 5.1, 5)
-    ('cost_limit=5 is kept', 'cost_limit=5 is kept within chance', 'cost_limit=5 is passed', 'cost_limit=5 is broken')
+    ('cost_limit=5 is kept', 'cost_limit=5 is passed, perhaps by chance', 'cost_limit=5 is passed', 'cost_limit=5 is broken')
     """
     if mean <= cost_limit:
         word = "kept"
     elif low is None:
         word = "passed"
     else:
-        word = "broken" if low > cost_limit else "kept within chance"
+        word = "broken" if low > cost_limit else "passed, perhaps by chance"
     return f"{name}={cost_limit:g} is {word}"
 
 
