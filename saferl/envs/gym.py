@@ -286,7 +286,7 @@ class _Cost(gymnasium.Wrapper):
             if name not in info:
                 raise ValueError(
                     f"{self.setting}: info has no {name!r}, it has {sorted(info)}; "
-                    "task.cost_key=null makes every cost 0."
+                    f"name its costs by task.cost_key=KEY or task.costs=[KEY,...]; task.cost_key=null makes every cost 0."
                 )
         return [number for name in self.names for number in self._numbers(info[name], 1)]
 
