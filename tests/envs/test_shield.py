@@ -272,6 +272,9 @@ def test_a_fallback_that_gives_no_number_is_named():
     bad = TensorDictModule(lambda ego: ego[..., :2] * math.nan, ["ego"], ["action"])
     with pytest.raises(ValueError, match="the fallback bad: an action is not finite"):
         Shield(fallbacks={"bad": bad}).correct(scene(60.0, 8.0))
+    road = TransformedEnv(BatchedIntersection(ROAD, 2, seed=0), Shield())
+    with pytest.raises(ValueError, match="the policy gave an action that is not finite"):
+        road.rollout(1, bad)
 
 
 @pytest.mark.parametrize(

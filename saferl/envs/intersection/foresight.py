@@ -253,6 +253,9 @@ def safe_for(
     Returns:
         Seconds [R] until the ego hits another body or leaves the road; inf where until ``horizon`` neither happens, or it
         arrives or stands safe before.
+
+    Raises:
+        ValueError: the driver's action is not finite.
     """
     ego = scene["ego"]
     until = torch.full_like(ego[:, 0], torch.inf)
@@ -263,8 +266,8 @@ def safe_for(
         action, how = first, scenario
         if time or action is None:
             action, how = driver(watched(prediction, scene))["action"], after
-        if not action.isfinite().all():  # every comparison below would call it safe
-            raise ValueError("an action is not finite.")
+            if not action.isfinite().all():  # every comparison below would call it safe
+                raise ValueError("an action is not finite.")
         time += 1 / how.policy_frequency
         scene, gap = prediction.step(how, scene, to_physical(action))
         ego = scene["ego"]

@@ -62,7 +62,7 @@ class Shield(Correction):
     else the number of the fallback that drives, from 1.
 
     Raises:
-        ValueError: no fallback, or one that is no TensorDictModule, ``horizon`` or ``frequency`` not above 0, ``margin`` below 0; in a step, an environment that is no intersection, or
+        ValueError: no fallback, or one that is no TensorDictModule, ``horizon`` or ``frequency`` not above 0, ``margin`` below 0; in a step, an action that is not finite, an environment that is no intersection, or
             not the batched one for the simulator's prediction.
 
     Examples:
@@ -157,6 +157,8 @@ class Shield(Correction):
         env, scenario = self._road()
         seen = tensordict.select(*self.reads).reshape(-1)
         proposed = seen.get(self.action_key)
+        if not proposed.isfinite().all():  # every comparison would call it safe
+            raise ValueError("the policy gave an action that is not finite.")
         report = TensorDict({}, seen.batch_size)
         if self.first is not None:
             report = self.first.correct(seen, **box)
