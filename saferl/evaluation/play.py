@@ -14,6 +14,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from saferl.envs.task import Task
+from saferl.envs.transforms import Shield
 from saferl.evaluation.progress import bar
 from saferl.evaluation.rows import episode_rows
 
@@ -82,6 +83,7 @@ def evaluate(
         raise ValueError(f"episodes must be >= 1, got {episodes}.")
     width, task = env.batch_size[0], cast(Task, env.task)
     seeds = task.episodes(seed, -(-episodes // width) * width)
+    fallbacks = next((part.names for part in env.modules() if isinstance(part, Shield)), ())
     rows: list[dict] = []
     with bar(total=episodes, desc="test", unit="episode", disable=not progress) as shown:
 
@@ -89,5 +91,6 @@ def evaluate(
             shown.update(min(count, episodes - shown.n))
 
         for chunk in seeds.split(width):
-            rows += episode_rows(play(policy, env, chunk.to(env.device), ended), chunk, task)
+            steps = play(policy, env, chunk.to(env.device), ended)
+            rows += episode_rows(steps, chunk, task, fallbacks)
     return [{"episode": i, **row} for i, row in enumerate(rows[:episodes])]

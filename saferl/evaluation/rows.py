@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +18,18 @@ from saferl.envs.task import Task
 from saferl.evaluation.costs import columns
 from saferl.evaluation.statistics import summarise
 
+_FALLBACK = "fallback_"  # begins the columns of a shield's fallbacks
 
-def episode_rows(steps: list[TensorDictBase], seeds: Tensor, task: Task) -> list[dict]:
+
+def episode_rows(
+    steps: list[TensorDictBase], seeds: Tensor, task: Task, fallbacks: Sequence[str] = ()
+) -> list[dict]:
     """Figures of each episode of :func:`saferl.evaluation.play.play`: one dict an episode, in the order of ``seeds``.
 
     Beside those of the task stand ``return``, ``cost_return`` (of several costs one for each,
     :func:`saferl.evaluation.costs.names`) and ``decisions``; where a projector was there, also
-    ``intervention_rate``, the share of decisions that it changed, and ``correction``, the mean size of such a change.
+    ``intervention_rate``, the share of decisions that it changed, and ``correction``, the mean size of such a change; behind a
+    shield with ``fallbacks`` of these names ``fallback_brake`` and so on, the share of decisions in which each drove.
     """
     after = steps[0]["next"]
 
@@ -43,6 +49,9 @@ def episode_rows(steps: list[TensorDictBase], seeds: Tensor, task: Task) -> list
         # A projector of one's own need not say where it intervened.
         moved = over_time("intervened") if "intervened" in after else (shift > 0).to(shift)
         values |= {"intervention_rate": moved, "correction": shift}
+    if fallbacks:
+        who = over_time("fallback")
+        values |= {f"{_FALLBACK}{name}": who == n for n, name in enumerate(fallbacks, 1)}
     rows, own = [], task.figures(steps, counts)
     for index, (seed, count) in enumerate(zip(seeds.tolist(), counts, strict=True)):
         # Exact sums: they do not depend on how long the episodes beside this one lasted.
@@ -51,6 +60,7 @@ def episode_rows(steps: list[TensorDictBase], seeds: Tensor, task: Task) -> list
             interventions = total["intervention_rate"]
             total["intervention_rate"] = interventions / count
             total["correction"] /= max(interventions, 1.0)
+        total |= {k: value / count for k, value in total.items() if k.startswith(_FALLBACK)}
         rows.append({"seed": seed, **own[index], **total, "decisions": count})
     return rows
 

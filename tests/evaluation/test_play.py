@@ -31,7 +31,7 @@ from saferl.envs.intersection import (
 )
 from saferl.envs.intersection.drivers import CautiousDriver, Driver, RandomDriver
 from saferl.envs.seeding import episode_seeds
-from saferl.envs.transforms import SafetyProjector
+from saferl.envs.transforms import SafetyProjector, Shield
 from saferl.evaluation.play import evaluate
 from saferl.evaluation.rows import write
 from saferl.evaluation.statistics import FIGURES
@@ -142,6 +142,17 @@ def test_interventions_are_shares_of_decisions():
         Driver(), BatchedIntersection(ROAD, num_envs=2, seed=0), 2, seed=0, progress=False
     )
     assert not any("intervention_rate" in row or "correction" in row for row in plain)
+
+
+def test_each_fallback_of_a_shield_is_counted():
+    env = TransformedEnv(BatchedIntersection(TRAFFIC, num_envs=4, seed=2), Shield())
+    rows = evaluate(Driver(), env, 4, seed=2, progress=False)  # blind to traffic
+    drove = [
+        [row[f"fallback_{name}"] for name in ("brake", "hold", "cautious", "go")] for row in rows
+    ]
+    assert any(share[0] > 0 for share in drove)
+    for row, shares in zip(rows, drove, strict=True):
+        assert sum(shares) == pytest.approx(row["intervention_rate"], abs=1e-12)
 
 
 def test_nothing_after_the_end_counts():
