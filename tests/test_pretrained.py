@@ -135,5 +135,11 @@ def test_another_action_is_corrected_as_its_own():
     for seen, action in ((unknown, own["action"]), (state, own["action"] * torch.nan)):
         with pytest.raises(ValueError, match="is not finite"):
             policy.project(seen, action)
+    sizes = r"ego \[8, 12\], vehicles \[8, \d+, 12\], action"
+    for size in ((8, 3), (7, 2)):
+        with pytest.raises(ValueError, match=sizes):
+            policy.project(state, torch.zeros(size))
+    with pytest.raises(ValueError, match="needs ego, vehicles, action, got no vehicles"):
+        policy.project({"ego": state["ego"]}, own["action"])
     with torch.inference_mode(), pytest.raises(RuntimeError, match="no_grad, not inference_mode"):
         policy.project(state, own["action"])

@@ -111,7 +111,8 @@ class SafePolicy(TensorDictModuleBase):
             The action to execute, its risk and what else is to be known, tensors [*B] and [*B, A].
 
         Raises:
-            ValueError: the policy has no projector along the gradient of a risk; an action or a risk is not finite.
+            ValueError: the policy has no projector along the gradient of a risk; an entry is missing or of another size than
+                it was trained with; an action or a risk is not finite.
 
         >>> import saferl
         >>> policy = saferl.load_policy("arsac")
@@ -123,8 +124,21 @@ class SafePolicy(TensorDictModuleBase):
         if not isinstance(self.projector, SafetyProjector):
             got = "none" if self.projector is None else type(self.projector).__name__
             raise ValueError(f"project needs a policy with a SafetyProjector, got {got}.")
-        seen = TensorDict({**state, "action": action}, action.shape[:-1])
-        told = self.projector.correct(seen, **self.box)
+        given = {**state, "action": action}
+        names = [str(key) for key in self.projector.reads]
+        if missing := [name for name in names if name not in given]:
+            raise ValueError(f"project needs {', '.join(names)}, got no {missing[0]}.")
+        shapes = ", ".join(f"{name} {[*given[name].shape]}" for name in names)
+        try:
+            seen = TensorDict(given, action.shape[:-1])
+            told = self.projector.correct(seen, **self.box)
+        except RuntimeError as error:  # of the batch or of a layer, which name no entry
+            if torch.is_inference_mode_enabled():  # the projector's own, which says all
+                raise
+            reason = str(error).splitlines()[0]
+            raise ValueError(
+                f"project needs sizes that the policy was trained with, got {shapes}: {reason}"
+            ) from error
         if not (action.isfinite().all() and told["risk_before"].isfinite().all()):
             raise ValueError(
                 "project needs numbers: the action, or the risk of the state, is not finite."
