@@ -213,6 +213,8 @@ class Trainer:
                 self._record(data)
         self.save()
         self.watch.judge(self._costs)
+        if not progress.updates:
+            log.warning("Nothing was learned: the budget ended before the first update.")
 
     @contextmanager
     def _logging(self) -> Iterator[None]:

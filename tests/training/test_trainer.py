@@ -137,6 +137,16 @@ def test_updates_follow_the_frames(tmp_path: Path):
     assert counts == [0, 0, 0, 1, 3, 4, 6, 7]
 
 
+def test_a_budget_that_ends_before_the_first_update_is_said(tmp_path: Path, caplog):
+    for share, said in (("0.1", True), ("1.0", False)):
+        (folder := tmp_path / share).mkdir()
+        trainer = trainer_of(folder, "algo=sac", "frames=8", f"learning.updates_per_frame={share}")
+        trainer.train()
+        assert any("Nothing was learned" in message for message in caplog.messages) is said
+        assert (trainer.progress.updates == 0) is said
+        caplog.clear()
+
+
 def test_learning_rates_are_linear_in_the_budget(tmp_path: Path):
     trainer = trainer_of(
         tmp_path, "algo=arsac", "learning.lr.actor=[1e-2,2e-3]", "learning.lr.critic=[1e-3,1e-3]"
