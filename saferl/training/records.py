@@ -81,18 +81,20 @@ class EpisodeWindow:
         }
 
     def short(self, cost_limit: float | Sequence[float] | None = None) -> dict[str, str]:
-        """The summary for a progress bar, each cost beside its limit; empty before the first episode."""
+        """The summary for a progress bar, each cost beside its limit, the longest last, as a narrow terminal cuts them; empty
+        before the first episode."""
         if not any(map(len, self.values.values())):
             return {}
         figures = self.summary()
-        bar = {"return": f"{figures['return']:.1f}"}
+        rates = {"SR": "success_rate", "CR": "collision_rate"}
+        bar = {name: f"{figures[key]:.0%}" for name, key in rates.items() if key in figures}
+        bar["return"] = f"{figures['return']:.1f}"
         for key, limit in zip(
             names("cost_return", self.costs), limits(cost_limit, self.costs), strict=True
         ):
             beside = "" if limit is None else f" of {limit:g}"
             bar[key.replace("cost_return", "cost")] = f"{figures[key]:.3f}{beside}"
-        rates = {"CR": "collision_rate", "SR": "success_rate"}
-        return bar | {name: f"{figures[key]:.0%}" for name, key in rates.items() if key in figures}
+        return bar
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         return dict(self.values)
