@@ -17,7 +17,7 @@ from saferl.algorithms.assemble import build_trainer
 from saferl.checkpoint.run import CONFIG
 from saferl.training.trainer import Trainer
 
-TRAFFIC = ("env=highway", "task.vehicles=3", "task=gs")
+TRAFFIC = ("env=highway", "task.vehicles=3", "task=gs", "task.duration=6")
 
 
 def everything(trainer: Trainer) -> dict:

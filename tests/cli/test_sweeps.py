@@ -140,12 +140,10 @@ def test_one_refused_job_of_a_sweep_stops_no_other(command, tmp_path: Path, caps
 @pytest.mark.parametrize(
     "name",
     [
-        "Läufe (1) 50%",
+        "Läufe (1) 50% a{b} it's #c",
         "algo=rsac,seed=0",
-        "a{b} it's #c",
         "ends\\",
         "007",
-        "true",
     ],
 )
 def test_a_path_may_hold_any_character(name: str, command, tmp_path: Path):

@@ -20,8 +20,8 @@ ALGOS = sorted(path.stem for path in (Path(config_dir()) / "algo").glob("*.yaml"
 LIMITS = ("cost_limit=1", "risk_limit=1")
 #: A road's own encoder reads no plain observation.
 TASKS = {
-    "batched": ("task=mixed", *EMPTY, "evaluation.drivers=[blind]"),
-    "highway": ("task=gs", "env=highway", "task.vehicles=0"),
+    "batched": ("task=mixed", *EMPTY, "evaluation.drivers=[blind]", "task.duration=3"),
+    "highway": ("task=gs", "env=highway", "task.vehicles=0", "task.duration=3"),
     "cart": ("task=cart", "encoder=mlp", *LIMITS),
     "gym": ("task=gym", "task.id=Pendulum-v1", "task.cost_key=null", "encoder=mlp", *LIMITS),
 }
