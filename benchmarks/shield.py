@@ -18,10 +18,14 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 import saferl
 from saferl.envs.intersection import BatchedIntersection, Scenario
-from saferl.envs.intersection.foresight import ConstantVelocity, Simulator
+from saferl.envs.intersection.foresight import AlongLanes, ConstantVelocity, Simulator
 from saferl.envs.transforms import Shield
 
-PREDICTIONS = {"constant velocity": ConstantVelocity, "simulator": Simulator}
+PREDICTIONS = {
+    "constant velocity": ConstantVelocity,
+    "along lanes": AlongLanes,
+    "simulator": Simulator,
+}
 
 
 def main() -> None:

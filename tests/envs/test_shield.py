@@ -17,7 +17,15 @@ from torchrl.envs.utils import check_env_specs
 from saferl.envs.cart import Cart, CartEnv
 from saferl.envs.intersection import BatchedIntersection, HighwayIntersection, Scenario
 from saferl.envs.intersection.drivers import Brake, CautiousDriver, Driver, Hold
-from saferl.envs.intersection.foresight import ConstantVelocity, Simulator, pick, safe_for
+from saferl.envs.intersection.foresight import (
+    AlongLanes,
+    ConstantVelocity,
+    Simulator,
+    pick,
+    safe_for,
+)
+from saferl.envs.intersection.geometry import ARM
+from saferl.envs.intersection.roads import lane_frames, lanes
 from saferl.envs.transforms import SafetyProjector, Shield
 
 ROAD = Scenario(task="gs").as_test()
@@ -37,8 +45,10 @@ def scene(y: float, speed: float, *others: tuple[float, float, float, float]) ->
     return TensorDict(seen | {"action": GO[None]}, [1])
 
 
-def lasts(seen: TensorDict, driver, first=None, horizon: float = 5.0, **settings: float) -> float:
-    prediction = ConstantVelocity(**settings)
+def lasts(
+    seen: TensorDict, driver, first=None, horizon: float = 5.0, kind=ConstantVelocity, **settings
+) -> float:
+    prediction = kind(**settings)
     start = prediction.begin(seen, None, ROAD)
     return safe_for(prediction, ROAD, start, driver, horizon, first).item()
 
@@ -87,6 +97,41 @@ def test_who_comes_from_behind_or_can_stop_is_trusted_to():
     assert lasts(across((-28.0, 2.0, 9.0, 0.0)), Brake()) == math.inf
     # 6 m before the ego's flank at 9 m/s: 13.5 m/s^2.
     assert lasts(across((-7.5, 2.0, 9.0, 0.0)), Brake()) == pytest.approx(0.8)
+
+
+def test_who_has_begun_to_turn_turns_on():
+    """An oncoming car, 2 m into its left turn, comes across the ego's lane in the middle of the box."""
+    route = torch.tensor(8)  # from the north, to the left, which is to the east
+    table = lanes(route, torch.zeros(()))
+    place, heading = lane_frames(table, torch.tensor(ARM + 2.0))
+    turns = scene(10.0, 6.0, (place.x.item(), place.y.item(), 7.0, heading.item()))
+    assert lasts(turns, Hold()) == math.inf  # straight on it would cross behind the ego
+    assert lasts(turns, Hold(), kind=AlongLanes) == pytest.approx(1.6)
+    prediction = AlongLanes()
+    start = prediction.begin(turns, None, ROAD)
+    told = prediction.moved(start, torch.tensor([0.5, 2.0])[:, None, None])
+    ways, angles = lane_frames(table, ARM + 2.0 + 7.0 * torch.tensor([0.5, 2.0]))
+    for key, value in (("x", ways.x), ("y", ways.y), ("heading", angles)):
+        torch.testing.assert_close(told[key][:, 0, 0], value, atol=1e-4, rtol=0)
+    # And so after decisions one after the other, with its velocity along it.
+    for _ in range(5):
+        start, _ = prediction.step(ROAD, start, torch.zeros(1, 2))
+    way, angle = lane_frames(table, torch.tensor(ARM + 2.0 + 7.0 * 0.5))
+    told = torch.stack([start[key][0, 0] for key in ("x", "y", "v_x", "v_y")])
+    aims = torch.stack([way.x, way.y, 7.0 * angle.cos(), 7.0 * angle.sin()])
+    torch.testing.assert_close(told, aims, atol=1e-3, rtol=0)
+
+
+def test_who_has_not_begun_to_turn_or_fits_no_lane_goes_straight_on():
+    """Three movements share an approach; a car that stands askew between the lanes follows none."""
+    for other in ((-25.0, 2.0, 9.0, 0.0), (-3.0, 1.0, 5.0, 2.4)):
+        seen = scene(29.0, 9.0, other)
+        ends = []
+        for prediction in (ConstantVelocity(), AlongLanes()):
+            start = prediction.begin(seen, None, ROAD)
+            way = prediction.moved(start, torch.tensor([0.5, 2.5])[:, None, None])
+            ends.append(torch.stack([way[key][:, 0, 0] for key in ("x", "y", "heading")]))
+        torch.testing.assert_close(*ends, atol=1e-4, rtol=0)
 
 
 def test_who_drives_ahead_may_brake_at_any_time():
@@ -152,7 +197,7 @@ def test_the_simulators_prediction_is_the_simulator():
     torch.testing.assert_close(told, truth)
 
 
-@pytest.mark.parametrize("prediction", [ConstantVelocity(), Simulator()])
+@pytest.mark.parametrize("prediction", [AlongLanes(), Simulator()])
 def test_scenes_do_not_feel_each_other(prediction):
     scenario = Scenario(task="mixed").as_test()
     env, seen = driven(scenario, 12, 45)

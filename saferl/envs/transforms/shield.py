@@ -18,7 +18,7 @@ from saferl.envs.intersection import Scenario
 from saferl.envs.intersection.batched import State
 from saferl.envs.intersection.drivers import Brake, CautiousDriver, Driver, Hold
 from saferl.envs.intersection.foresight import (
-    ConstantVelocity,
+    AlongLanes,
     Prediction,
     over,
     pick,
@@ -39,11 +39,11 @@ class Shield(Correction):
     (Sha, *Using simplicity to control complexity*, 2001) with a look ahead as its decision.
 
     It learns nothing and has no state. What it promises is as good as the prediction: by
-    :class:`~saferl.envs.intersection.foresight.ConstantVelocity` it knows no more than the policy; by
+    :class:`~saferl.envs.intersection.foresight.AlongLanes` it knows the road and no more than the policy; by
     :class:`~saferl.envs.intersection.foresight.Simulator` it knows what no car knows.
 
     Args:
-        prediction: of the others; None: constant velocity.
+        prediction: of the others; None: they go on along their lanes.
         fallbacks: drivers by name, in the order in which they are preferred: TensorDictModules that read ``ego``,
             ``vehicles`` and ``route`` (of the form ``world``) and write ``action``. None: :class:`Brake`, :class:`Hold`,
             :class:`CautiousDriver` and the blind :class:`Driver`, which goes.
@@ -107,7 +107,7 @@ class Shield(Correction):
                 raise ValueError(f"{key} must be > 0, got {value}.")
         if margin < 0:
             raise ValueError(f"margin must be >= 0, got {margin}.")
-        self.prediction = ConstantVelocity() if prediction is None else prediction
+        self.prediction = AlongLanes() if prediction is None else prediction
         self.names, self.fallbacks = [*fallbacks], torch.nn.ModuleList(fallbacks.values())
         self.horizon, self.margin, self.frequency = float(horizon), float(margin), frequency
         self.name, self.first = name, first
