@@ -162,7 +162,7 @@ def smaller(door: str, arguments: list[str]) -> list[str]:
     arguments += [each for each in fewer if each.partition("=")[0] not in names]
     small = (
         *EMPTY,
-        "task.duration=5",
+        "task.duration=2",
         *(SMALL if door == "train" else ("episodes=2", "draw=none")),
     )
     other = any(re.match(r"(task|experiment)=(gym|cart|tank)", a) for a in arguments)

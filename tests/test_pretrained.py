@@ -10,7 +10,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import saferl
-from saferl.algorithms.policy import SafePolicy, trained_agent
+from saferl.algorithms.policy import SafePolicy, compiling, trained_agent
 from saferl.checkpoint.policy import EXPORTED
 from saferl.checkpoint.run import run_config
 from saferl.config.locate import pretrained_run, shipped
@@ -45,7 +45,7 @@ def test_a_shipped_policy_drives(name: str):
     assert cfg.algo_name == name and (policy.projector is not None) == (name == "arsac")
     seeds = SCENARIO.episodes(11, 8)
     state = BatchedIntersection(SCENARIO, 8).reset(seeds=seeds)
-    agent = trained_agent(cfg, pretrained_run(name))
+    agent = trained_agent(compiling(cfg, False), pretrained_run(name))
     env = TransformedEnv(BatchedIntersection(SCENARIO, 8), *agent.transforms)
     theirs = env.reset(seeds=seeds)
     alone = BatchedIntersection(SCENARIO, 8)
