@@ -45,7 +45,7 @@ class Curve:
 
     Attributes:
         frames: [N].
-        mean, low, high: [N], over seeds; the 95% band is Student's t and NaN for a single seed.
+        mean, low, high: [N], over seeds; the 95% band is Student's t, NaN of fewer than three: of two it is as wide as the panel.
         seeds: how many.
     """
 
@@ -84,7 +84,7 @@ def band(runs: Sequence[Mapping[str, np.ndarray]], figure: str) -> Curve:
     grid = grid[(grid >= first) & (grid <= last)]
     values = np.stack([np.interp(grid, frames, column) for frames, column in known])
     mean, half = values.mean(0), np.full(len(grid), np.nan)
-    if len(values) > 1:
+    if len(values) > 2:
         half = stats.t.ppf(0.975, len(values) - 1) * stats.sem(values)
     low, high = mean - half, mean + half
     if figure.endswith("_rate"):

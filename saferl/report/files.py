@@ -72,4 +72,4 @@ CLAIMS = """\
 Differences of means in MEAN, with a 95% interval over seeds and episodes: confirmed or refuted where it leaves out 0.
 "Not slower" is confirmed where ARSAC is faster. Each interval stands for itself."""
 CURVES = """\
-Means and 95% bands (Student's t) over the seeds of finished runs, of actions with exploration; not comparable with the tests above."""
+Means and 95% bands (Student's t) over three seeds or more of finished runs, of actions with exploration; not comparable with the tests above."""
