@@ -28,7 +28,13 @@ from saferl.envs.intersection.geometry import (
     wrap,
 )
 from saferl.envs.intersection.observation import as_world
-from saferl.envs.intersection.roads import SPEED_LIMIT, lane_frames, lane_project, lanes
+from saferl.envs.intersection.roads import (
+    MOVEMENTS,
+    SPEED_LIMIT,
+    lane_frames,
+    lane_project,
+    lanes,
+)
 from saferl.envs.intersection.scenario import STANDING, SUBSTEPS, Scenario
 
 _STILL = 1e-3  # m, by which a gap may change between two cars that stand
@@ -139,10 +145,8 @@ class ConstantVelocity(Prediction):
         way = self.moved(scene, moves)
         left = (1 - passed[-1] / until).clamp(min=0.0)
         at = torch.stack(moments)[:, :, None]
-        mine, theirs = (
-            frame(*at[..., [0, 1, 4]].unbind(-1)),
-            frame(way["x"], way["y"], way["heading"]),
-        )
+        mine = frame(*at[..., [0, 1, 4]].unbind(-1))
+        theirs = frame(way["x"], way["y"], way["heading"])
         time = scene["time"] + passed[:, None]
         sees = (at[..., 2] < _REST) & (speed > STANDING)
         stops = sees & (speed <= 2 * self.braking * time[..., None])
@@ -186,7 +190,7 @@ class AlongLanes(ConstantVelocity):
     def begin(self, seen: TensorDictBase, env: Any, scenario: Scenario) -> State:
         scene = super().begin(seen, env, scenario)
         x, y, heading = (scene[key][..., None] for key in ("x", "y", "heading"))
-        every = lanes(torch.arange(16, device=x.device), x)
+        every = lanes(torch.arange(4 * len(MOVEMENTS), device=x.device), x)
         s, lateral = lane_project(every, x, y)
         apart = wrap(heading - lane_frames(every, s)[1])
         miss = lateral.abs() + 5 * apart.abs() + _TURNS * (every.side != 0)
