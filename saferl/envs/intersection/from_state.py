@@ -31,7 +31,7 @@ class FromState:
 
     Reads ``ego`` [B, 6] and ``vehicles`` [B, N, 6] (x, y, v_x, v_y, phi, omega in highway-env's frame: x to the right, y
     down), absent rows NaN throughout, N from 0; and ``route`` [B] int64, a row of :data:`ROUTES`. Returns ``ego`` [B, F] and
-    ``vehicles`` [B, M, G].
+    ``vehicles`` [B, M, G]; ``ego`` is NaN where a car is known in part or there is no such route.
 
     >>> ego, route = torch.tensor([[2.0, 55.0, 8.0, 0.0, -1.5708, 0.0]]), torch.tensor([1])
     >>> alone = FromState()(ego, torch.full((1, 3, 6), torch.nan), route)
@@ -60,7 +60,9 @@ class FromState:
         unknown = vehicles.isnan()
         present = ~unknown.any(-1)
         others = torch.where(present[..., None], vehicles, 0.0)
-        own, table, _ = observe(ego, others, present, route, self.rows, self.form)
-        # A car of which only a part is known must not seem to be absent.
-        partly = (unknown.any(-1) & ~unknown.all(-1)).any(-1, keepdim=True)
-        return {"ego": torch.where(partly, torch.nan, own), "vehicles": table}
+        there = route.clamp(0, len(ROUTES) - 1)
+        own, table, _ = observe(ego, others, present, there, self.rows, self.form)
+        # A car of which only a part is known must not seem to be absent, nor -1 the last route.
+        partly = (unknown.any(-1) & ~unknown.all(-1)).any(-1)
+        unfit = (partly | (there != route))[:, None]
+        return {"ego": torch.where(unfit, torch.nan, own), "vehicles": table}
