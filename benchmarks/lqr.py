@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,29 +56,44 @@ class LQR(gymnasium.Env):
             gains.append(gain)
         return gains[::-1]
 
-    def sums(self, gains: list[np.ndarray]) -> tuple[float, float]:
-        """Expected reward and cost of an episode under u = -K_t x, which should not reach the box."""
+    def moments(self, gains: list[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """E[x x'] and E[u u'] in each step under u = -K_t x, as if actions had no bounds."""
         moment = self.spread**2 * np.eye(len(self.A))
-        reward = cost = 0.0
         for gain in gains:
-            reward -= np.trace((self.Q + gain.T @ self.R @ gain) @ moment)
-            cost += np.trace((self.M + gain.T @ self.N @ gain) @ moment)
+            yield moment, gain @ moment @ gain.T
             closed = self.A - self.B @ gain
             moment = closed @ moment @ closed.T + self.noise**2 * np.eye(len(self.A))
+
+    def sums(self, gains: list[np.ndarray]) -> tuple[float, float]:
+        """Expected reward and cost of an episode under u = -K_t x, as if actions had no bounds."""
+        reward = cost = 0.0
+        for state, force in self.moments(gains):
+            reward -= np.trace(self.Q @ state) + np.trace(self.R @ force)
+            cost += np.trace(self.M @ state) + np.trace(self.N @ force)
         return float(reward), float(cost)
 
     def optimum(self, limit: float) -> tuple[float, float]:
-        """The best return of an episode whose expected cost is at most ``limit``, and its multiplier."""
+        """The best return of an episode whose expected cost is at most ``limit``, and its multiplier.
+
+        Raises:
+            ValueError: the bounds of the actions lie within two standard deviations of the best policy's.
+        """
 
         def excess(log: float) -> float:
             return self.sums(self.gains(math.exp(log)))[1] - limit
 
         multiplier = math.exp(brentq(excess, -12.0, 12.0))  # pyright: ignore[reportArgumentType]
-        return self.sums(self.gains(multiplier))[0], multiplier
+        best = self.gains(multiplier)
+        most = max(math.sqrt(force.diagonal().max()) for _, force in self.moments(best))
+        if most > 0.5:
+            raise ValueError(f"Bounds of 1 cut off forces whose standard deviation is {most:.2f}.")
+        return self.sums(best)[0], multiplier
 
 
 #: A state of one and of two dimensions; a budget of effort, and one of distance.
-EFFORT = dict(A=[[1.0]], B=[[0.5]], Q=[[1.0]], R=[[0.01]], M=[[0.0]], N=[[4.0]], noise=0.2)
+EFFORT = dict(
+    A=[[1.0]], B=[[1.0]], Q=[[1.0]], R=[[0.01]], M=[[0.0]], N=[[64.0]], spread=0.5, noise=0.1,
+)  # fmt: skip
 DISTANCE = dict(
     A=[[0.95, 0.2], [0.0, 0.9]], B=[[0.0], [0.3]], Q=[[0.1, 0.0], [0.0, 0.05]], R=[[2.0]],
     M=[[1.0, 0.0], [0.0, 0.0]], N=[[0.0]], spread=0.5, noise=0.1,
