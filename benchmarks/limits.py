@@ -3,10 +3,10 @@
     python benchmarks/limits.py OUT [--algos cpo ppo_lag sac_lag sac_pid] [--problems Effort Distance] [--seeds 0 1 2]
         [--frames 200000] [--episodes 2000] [--jobs 2] [--set KEY=VALUE ...] [--json PATH]
 
-``Effort`` is a cart on a line whose steps cost what they steer (46 without a limit, 20 allowed); ``Distance`` a mass with
+``Effort`` is a cart on a line whose steps cost what they steer (33 without a limit, 20 allowed); ``Distance`` a mass with
 friction whose steps cost how far off it is (9.7, 6 allowed), benchmarks/lqr.py. Prints a row for each run: mean cost and return of
-the closing test with 95% intervals, beside the limit and the best return under it (Riccati, of all linear policies
-in time). What is in OUT already is not run again.
+the closing test with 95% intervals, beside the limit and the best return under it (Riccati, forces cut off at their
+bounds). What is in OUT already is not run again.
 """
 
 from __future__ import annotations
