@@ -80,7 +80,7 @@ def test_reads_the_live_critic():
     # The capture alone takes seconds; generating code takes up to a minute.
     ["eager", pytest.param("inductor", marks=pytest.mark.slow)],
 )
-@pytest.mark.parametrize("batch", [1, 40])
+@pytest.mark.parametrize("batch", [pytest.param(1, marks=pytest.mark.slow), 40])
 def test_compiled_in_parts(monkeypatch, backend, batch):
     """More states than one part holds, some of them safe, corrected as without compiling."""
     monkeypatch.setattr(torch, "compile", functools.partial(torch.compile, backend=backend))
