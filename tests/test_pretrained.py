@@ -16,7 +16,7 @@ from saferl.checkpoint.run import run_config
 from saferl.config.locate import pretrained_run, shipped
 from saferl.envs.intersection import BatchedIntersection, Scenario
 
-SHIPPED = ("arsac", "asac", "sac_lag")
+SHIPPED = ("arsac", "arsac_plus", "asac", "sac_lag")
 SCENARIO = Scenario(task="mixed").as_test()
 
 
@@ -42,7 +42,7 @@ def test_a_shipped_policy_drives(name: str):
     """Eight episodes, the same actions as with the projector as a transform of the environment."""
     policy = saferl.load_policy(name)
     cfg = run_config(pretrained_run(name))
-    assert cfg.algo_name == name and (policy.projector is not None) == (name == "arsac")
+    assert cfg.algo_name == name and (policy.projector is not None) == name.startswith("arsac")
     seeds = SCENARIO.episodes(11, 8)
     state = BatchedIntersection(SCENARIO, 8).reset(seeds=seeds)
     agent = trained_agent(compiling(cfg, False), pretrained_run(name))
