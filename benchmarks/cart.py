@@ -52,7 +52,7 @@ SETTINGS = {
     "sac_pid": (),
     "cpo": ("loss.damping=0.01", "learning.rollout_frames=2560", "frames=800000"),
     "ppo_lag": (*_PLAIN, "frames=800000"),
-    "ppo_pid": (*_PLAIN, "frames=800000"),
+    "ppo_pid": _PLAIN,
     "p3o": _PLAIN,
     "focops": _PLAIN,
     "crpo": _PLAIN,

@@ -1,9 +1,9 @@
 """Which choices learning needs: one undone at a time, a feature of the observation or a setting.
 
-    python benchmarks/choices.py OUT [--algo sac] [--undo TARGETS STANDSTILL ...] [--frames 200000] [--seeds 0 1 2]
+    python benchmarks/choices.py OUT [--algo sac] [--undo targets standstill ...] [--frames 200000] [--seeds 0 1 2]
         [--episodes 500] [--jobs 2] [--set KEY=VALUE ...] [--json PATH]
 
-What can be undone stands in ``CHOICES``. A feature is left out by dividing it by 1e9 in every network; sizes, initial weights and all
+What can be undone stands in ``CHOICES``, as far as ``--algo`` has it (SAC no multiplier). A feature is left out by dividing it by 1e9 in every network; sizes, initial weights and all
 else stay. Trains on ``task=mixed`` at equal frames and updates, tests 500 episodes each of left, straight and right at
 10 Hz, and prints the mean over the seeds, its 95% interval over them (Student's t), and on how many seeds a choice was missed.
 What is in OUT already is not run again.

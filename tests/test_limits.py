@@ -8,7 +8,7 @@ from lqr import LQR, PROBLEMS
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_the_sums_are_those_of_played_episodes(name: str):
+def test_the_optimum_is_what_the_environment_pays(name: str):
     """Steps of the environment, actions kept within their bounds."""
     env, limit = LQR(**PROBLEMS[name].matrices), PROBLEMS[name].limit
     best, multiplier = env.optimum(limit)
