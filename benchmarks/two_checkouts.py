@@ -1,12 +1,13 @@
-"""Updates a second of this checkout and of another, in turn.
+"""Updates or decisions a second of this checkout and of another, in turn.
 
-    python benchmarks/two_checkouts.py OTHER [--runs "algo=arsac encoder.width=64" "algo=sac"]
+    python benchmarks/two_checkouts.py OTHER [--what updates] [--runs "algo=arsac encoder.width=64" "algo=sac"]
         [--modes eager compiled] [--batch 256] [--rounds 5] [--seconds 3] [--threads 1] [--json PATH]
 
 OTHER is a folder with another commit of saferl (``git worktree add ../before COMMIT``), which runs on the same
 packages. Each composition is built in a process of its own by either checkout, on the world's observation, warmed
 up, and then measured in rounds, one process after the other, so that load meets all alike. Of compiled rows it
-is printed how many graphs torch holds, and how long it took to have them.
+is printed how many graphs torch holds, and how long it took to have them. ``--what decisions`` steps the simulation
+of the composition's task with ``--batch`` environments and random actions instead, compiled or not.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,48 @@ def learner_of(cfg: Any) -> Any:
         return build_learner(cfg, build_agent(cfg).loss)
     whole = "cfg" in inspect.signature(algorithm_of).parameters  # an older commit
     return algorithm_of(cfg if whole else cfg.learning).learner(build_agent(cfg).loss, cfg.compile)
+
+
+def updates(cfg: Any, options: Any) -> Callable[[], int]:
+    """Makes one update."""
+    learner, data = learner_of(cfg), transitions(options.batch, options.device)
+
+    def work() -> int:
+        learner.update(data)
+        return 1
+
+    return work
+
+
+def decisions(cfg: Any, options: Any) -> Callable[[], int]:
+    """Makes a decision in each environment."""
+    import hydra
+    import torch
+
+    from saferl.envs.intersection import BatchedIntersection
+
+    env = BatchedIntersection(
+        hydra.utils.instantiate(cfg.task),
+        options.batch,
+        device=options.device,
+        compile_physics=cfg.compile,
+        seed=0,
+    )
+    generator = torch.Generator(options.device).manual_seed(0)
+    data = env.reset()
+
+    def work() -> int:
+        nonlocal data
+        noise = torch.rand(options.batch, 2, generator=generator, device=options.device)
+        data["action"] = 2 * noise - 1
+        _, data = env.step_and_maybe_reset(data)
+        return options.batch
+
+    return work
+
+
+#: What is counted, by the word of the command line.
+WHAT = {"updates": updates, "decisions": decisions}
 
 
 def serve(overrides: list[str], options: Any) -> None:
@@ -57,12 +101,7 @@ def serve(overrides: list[str], options: Any) -> None:
         if "observation" in cfg.task:  # older commits have no other than the world's
             cfg = compose("config", [*overrides, "task.observation=world"])
     torch.manual_seed(0)
-    learner, data = learner_of(cfg), transitions(options.batch, device)
-
-    def work() -> int:
-        learner.update(data)
-        return 1
-
+    work = WHAT[options.what](cfg, options)
     begin = time.perf_counter()
     for _ in range(3):
         work()
@@ -77,7 +116,7 @@ class Side:
 
     def __init__(self, checkout: Path, run: str, mode: str, options: Any):
         command = [sys.executable, __file__, "--serve", run, "--modes", mode]
-        for name in ("batch", "threads", "device", "clock"):
+        for name in ("what", "batch", "threads", "device", "clock"):
             command += [f"--{name}", str(getattr(options, name))]
         self.child = subprocess.Popen(
             command,
@@ -108,6 +147,7 @@ def main() -> None:
         nargs="+",
         default=["algo=arsac encoder.width=64", "algo=sac encoder.width=128"],
     )
+    arguments.add_argument("--what", choices=list(WHAT), default="updates")
     arguments.add_argument("--modes", nargs="+", default=["eager", "compiled"])
     arguments.add_argument("--batch", type=int, default=256)
     arguments.add_argument("--serve", metavar="RUN", help="for the children alone")
@@ -125,7 +165,7 @@ def main() -> None:
             for name, checkout in checkouts.items():
                 side = sides[run, mode, name] = Side(checkout, run, mode, options)
                 print(
-                    f"{run}, {mode}, {name}: three updates after {side.ready['first']:.0f} s, "
+                    f"{run}, {mode}, {name}: three steps after {side.ready['first']:.0f} s, "
                     f"{side.ready['graphs']} graphs",
                     flush=True,
                 )
@@ -136,13 +176,16 @@ def main() -> None:
     for side in sides.values():
         side.child.kill()
     speed = medians(rates)  # pyright: ignore[reportArgumentType]
-    print(f"\n{conditions(options)}, batch {options.batch}, updates/s")
+    print(f"\n{conditions(options)}, batch {options.batch}, {options.what}/s")
     for run in options.runs:
         for mode in options.modes:
             here, other = (speed[run, mode, name] for name in checkouts)  # pyright: ignore
             print(f"{run}, {mode}: {here:.1f} here, {other:.1f} there, ratio {here / other:.2f}")
             figures[f"{run}, {mode}"] = {
-                name: {"updates_per_second": rates[run, mode, name], **sides[run, mode, name].ready}
+                name: {
+                    f"{options.what}_per_second": rates[run, mode, name],
+                    **sides[run, mode, name].ready,
+                }
                 for name in checkouts
             } | {"ratio": here / other}
     write(options.json, figures | {"conditions": conditions(options)})

@@ -55,6 +55,7 @@ def run(tmp_path_factory) -> Path:
         ["oracle", "--episodes", "2"],
         ["two_checkouts", ".", "--runs", "algo=sac encoder.width=16", "--modes", "eager", "--batch", "8",
          *SHORT],
+        ["two_checkouts", ".", "--what", "decisions", "--runs", "task=mixed", "--modes", "eager", "--batch", "8", *SHORT],
         ["reward_audit", "--episodes", "4"],
         ["workers", "--backends", "batched", "--workers", "1", "--set", "encoder.width=16", *SHORT],
         ["soak", "--decisions", "640", "--updates", "20", "--num-envs", "16", "--set", "env.compile_physics=false",
