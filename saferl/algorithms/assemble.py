@@ -30,7 +30,6 @@ from saferl.training.experience import check_memory
 from saferl.training.limit import watch_of
 from saferl.training.progress import Budget
 from saferl.training.records import EpisodeWindow
-from saferl.training.signals import ProjectorProgress
 from saferl.training.trainer import Trainer
 from saferl.training.watchdog import Watchdog
 
@@ -216,9 +215,13 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
     with ExitStack() as unless_built:
         collector = collecting.collect(plan)
         unless_built.callback(collector.shutdown)
-        make_env = partial(build_env, cfg.env, parts.task, device=parts.device)
+
+        def make_env(num_envs: int, seed: int) -> EnvBase:
+            wraps = [each.clone() for each in agent.wraps]  # a transform is of one environment
+            return build_env(cfg.env, parts.task, num_envs, seed, parts.device, wraps)
+
         learner = algorithm.learner(agent.loss, cfg.compile)
-        experience = algorithm.experience(agent, learner, parts.task, make_env, num_envs, cfg.seed)
+        experience = algorithm.experience(agent, parts.task, make_env, num_envs, cfg.seed)
         stored = collector.example().select(*agent.stored, strict=False)
         capacity = experience.buffer.storage.max_size
         check_memory(algorithm.kept, capacity, stored, parts.device)
@@ -240,7 +243,7 @@ def build_trainer(cfg: DictConfig, run: Path) -> Trainer:
         )
         if cfg.lagrange.signal._target_ is not None:
             make(cfg.lagrange.signal).register(trainer)
-        if agent.projector is not None and hasattr(agent.projector, "set_progress"):
-            ProjectorProgress(agent.projector).register(trainer)
+        if (projector := agent.projector) is not None:  # it may begin later
+            trainer.after_collect.append(lambda _, spent: projector.set_progress(spent))
         unless_built.pop_all()
     return trainer

@@ -155,7 +155,6 @@ class Algorithm(ABC):
     def experience(
         self,
         agent: Agent,
-        learner: Learner,
         task: Task,
         build_env: Callable[[int, int], EnvBase],
         num_envs: int,
@@ -164,7 +163,7 @@ class Algorithm(ABC):
         """What the learner updates from.
 
         Args:
-            agent, learner, task: what learns what.
+            agent, task: what learns what.
             build_env: makes more environments from their number and a seed.
             num_envs: environments at once.
             seed: of the mini-batches.

@@ -84,7 +84,6 @@ class OffPolicy(OffPolicyLearning, Algorithm):
     def experience(
         self,
         agent: Agent,
-        learner: Learner,
         task: Task,
         build_env: Callable[[int, int], EnvBase],
         num_envs: int,

@@ -73,12 +73,7 @@ class OnPolicy(OnPolicyLearning, Algorithm):
         loss.make_value_estimator(ValueEstimators.GAE, gamma=gamma, lmbda=self.gae_lambda)
 
     def learner(self, loss: LossModule, compile: bool) -> Learner:
-        return Learner(
-            loss,
-            self.optimizer(loss),
-            compile=compile,
-            before_updates=before_updates(loss),
-        )
+        return Learner(loss, self.optimizer(loss), compile=compile)
 
     def decisions(self, num_envs: int) -> int:
         return -(-self.rollout_frames // num_envs)
@@ -97,7 +92,6 @@ class OnPolicy(OnPolicyLearning, Algorithm):
     def experience(
         self,
         agent: Agent,
-        learner: Learner,
         task: Task,
         build_env: Callable[[int, int], EnvBase],
         num_envs: int,
@@ -116,21 +110,27 @@ class OnPolicy(OnPolicyLearning, Algorithm):
         return Epochs(
             buffer,
             stored=(*agent.stored, *ADVANTAGES, *agent.loss.in_keys),
-            begin=learner.begin,
+            begin=begin_of(agent.loss),
             epochs=self.epochs,
             reward_scale=self.reward_scale,
             generator=generator,
         )
 
 
-def before_updates(loss: Any) -> list[Callable[[TensorDictBase], Any]]:
+def begin_of(loss: Any) -> Callable[[TensorDictBase], None]:
     """What an on-policy loss does with a whole batch: its advantages, and the step of its policy if it has one."""
-    if not hasattr(loss, "begin"):  # TorchRL's own losses leave their advantages to their estimator
+    if hasattr(loss, "begin"):
+        hooks = [loss.begin, *([loss.policy_step().step] if hasattr(loss, "policy_step") else [])]
+    else:  # TorchRL's own losses leave their advantages to their estimator
         estimate = partial(
             loss.value_estimator,
             params=loss.critic_network_params.detach(),
             target_params=loss.target_critic_network_params,
         )
-        return [partial(score_actions, loss), estimate]
-    step = [loss.policy_step().step] if hasattr(loss, "policy_step") else []
-    return [loss.begin, *step]
+        hooks = [partial(score_actions, loss), estimate]
+
+    def begin(data: TensorDictBase) -> None:
+        for hook in hooks:
+            hook(data)
+
+    return begin

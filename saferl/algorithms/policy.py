@@ -174,7 +174,7 @@ def trained_agent(cfg: DictConfig, path: Path) -> Agent:
     agent = load_agent(cfg, path, "checkpoint")
     if agent.transform is not None:
         agent.transform.enabled = False  # a test reports what was earned
-    if agent.projector is not None and hasattr(agent.projector, "set_progress"):
+    if agent.projector is not None:
         spent = Budget(cfg.episodes, cfg.frames).spent(**progress(path))
         agent.projector.set_progress(spent)
     return agent

@@ -94,7 +94,9 @@ class CostValueMixin(LossMixin):
     def add_cost_value(self, cost_critic: TensorDictModule, costs: int = 1) -> None:
         """Take the cost critic of so many costs in, and make the estimators, by the names that the two values have."""
         self.costs = costs
-        self.convert_to_functional(cost_critic, "cost_critic")
+        actor: Any = self.actor_network
+        policy = list(actor.parameters()) if self.separate_losses else None
+        self.convert_to_functional(cost_critic, "cost_critic", compare_against=policy)
         self.set_keys(
             value=written(self.critic_network, self.tensor_keys.value),
             state_cost_value=written(cost_critic, self.tensor_keys.state_cost_value),
@@ -131,8 +133,8 @@ class CostValueMixin(LossMixin):
 
         Reads the value networks' inputs at the root and under ``"next"``; under ``"next"``: ``"reward"`` ``[*B, T, 1]`` and
             ``"cost"`` ``[*B, T, K]`` in their units, ``"done"``, ``"terminated"`` ``[*B, T, 1]``.
-        Writes ``"state_value"``, ``"advantage"``, ``"value_target"`` in the unit of the reward ``[*B, T, 1]``;
-            ``"state_cost_value"``, ``"cost_advantage"``, ``"cost_value_target"`` in the units of the costs ``[*B, T, K]``.
+        Writes ``"state_value"`` (under ``"next"``, too), ``"advantage"``, ``"value_target"`` in the unit of the reward
+            ``[*B, T, 1]``; ``"state_cost_value"``, ``"cost_advantage"``, ``"cost_value_target"`` in the units of the costs ``[*B, T, K]``.
 
         Raises:
             KeyError: the batch holds no cost.
@@ -147,7 +149,9 @@ class CostValueMixin(LossMixin):
             target_params=self.target_critic_network_params,
         )
         # Estimators want one shape of all.
-        costs = tensordict.clone(False)
+        costs = tensordict.exclude(
+            keys.state_cost_value
+        )  # of an earlier time, which "next" has not
         following = costs.get("next").clone(False)
         done = following.get(keys.done)
         following.set(keys.done, done.expand(*done.shape[:-1], self.costs))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import chain
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -30,8 +29,6 @@ class Learner:
             learning rate, linear in the fraction of the budget that is spent.
         target_updater: soft update of the loss's targets; None where it has none.
         after_update: called with the loss's output after each step (a multiplier, for example).
-        before_updates: called with each whole batch of fresh transitions [*B, T] before its updates (advantages,
-            a policy's own step).
         order: ``"joint"``: every term at the same parameters, then one step of all, as TorchRL's
             losses do. ``"sequential"`` (paper, Algorithm 1): critics, actor and temperature in turn,
             each at the parameters that the one before left, which evaluates the loss three times.
@@ -51,7 +48,6 @@ class Learner:
         after_update: list[Callable[[TensorDictBase], None]] | None = None,
         order: str = "joint",
         compile: bool = False,
-        before_updates: Sequence[Callable[[TensorDictBase], Any]] = (),
     ):
         if order not in ORDERS:
             raise ValueError(f"order must be one of {', '.join(ORDERS)}, got {order!r}.")
@@ -64,7 +60,6 @@ class Learner:
         self.stages = [names for names in ORDERS[order] if there & set(names)]
         self.loss, self.optimizer, self.target_updater = loss, optimizer, target_updater
         self.after_update = after_update or []
-        self.before_updates = before_updates
         self.gradients: dict[tuple[str, ...], Callable] = {}
         for names in self.stages:
             gradients = partial(self._gradients, names)
@@ -95,11 +90,6 @@ class Learner:
         # A fused Adam reads a transposed gradient in the wrong order without a word (torch 2.13).
         gradients = [None if slope is None else slope.contiguous() for slope in gradients]
         return losses.detach(), batch.exclude(*given).detach(), gradients
-
-    def begin(self, data: TensorDictBase) -> None:
-        """Take a whole batch of fresh transitions [*B, T], in place, before it is cut into mini-batches."""
-        for hook in self.before_updates:
-            hook(data)
 
     def update(self, batch: TensorDictBase) -> TensorDict:
         """Returns the loss terms and metrics, detached scalars; priorities come into the batch."""

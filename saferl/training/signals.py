@@ -9,7 +9,6 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from tensordict import TensorDictBase
 
-from saferl.envs.transforms import Correction
 from saferl.evaluation.costs import names
 from saferl.modules import LagrangeMultiplier
 from saferl.modules.limits import as_limit
@@ -119,20 +118,6 @@ class EpisodeSignal:
             progress, budget = self._trainer.progress, self._trainer.budget
             elapsed = (budget.done(progress) - progress.last_end) / budget.whole
         self._lagrange.update(self._lagrange.penalty(violation), elapsed)
-
-
-class ProjectorProgress:
-    """Tells a projector which share of the budget is spent, so that it can begin later.
-
-    Args:
-        projector: the environment's transform.
-    """
-
-    def __init__(self, projector: Correction):
-        self.projector = projector
-
-    def register(self, trainer: Trainer) -> None:
-        trainer.after_collect.append(lambda _, spent: self.projector.set_progress(spent))
 
 
 def _multiplier(trainer: Trainer) -> LagrangeMultiplier:

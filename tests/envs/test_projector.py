@@ -15,7 +15,7 @@ from torchrl.data import (
     ReplayBuffer,
     TensorDictReplayBuffer,
 )
-from torchrl.envs import ParallelEnv, SerialEnv, Transform, TransformedEnv
+from torchrl.envs import ParallelEnv, SerialEnv, StepCounter, Transform, TransformedEnv
 from torchrl.envs.utils import RandomPolicy, check_env_specs
 
 from saferl.envs.transforms import ExecutedAction, SafetyProjector
@@ -236,6 +236,15 @@ def test_start_of_the_correction():
     assert projector().enabled and not resumed.enabled
     resumed.load_state_dict(env.transform.state_dict())
     assert resumed.enabled
+
+
+def test_an_environment_that_is_wrapped_again_hears_the_start():
+    """TorchRL makes one of both wrappings, of clones."""
+    own = projector(start=0.5)
+    env = TransformedEnv(TransformedEnv(EchoEnv((8,)), own), StepCounter())
+    assert not env.rollout(3)["next", "intervened"].any()
+    own.set_progress(1.0)
+    assert env.rollout(3)["next", "intervened"].any()
 
 
 @pytest.mark.parametrize("keep", ["last", "safest"])

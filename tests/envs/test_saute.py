@@ -9,7 +9,7 @@ import torch
 from small import EMPTY, SMALL, compose
 from tensordict import TensorDict
 from torchrl.data import Composite, Unbounded
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from saferl.algorithms.assemble import build_env, build_trainer
@@ -49,6 +49,38 @@ def test_the_limit_itself_may_be_spent():
     env = TransformedEnv(CartEnv(Cart(), 1, seed=0), Saute(0.25))
     steps = played(env, [0.5, 0.0])
     assert (steps["next", "budget"] == 0).all() and (steps["next", "reward"] != -1).all()
+
+
+@pytest.mark.parametrize("steps", [3, 10, 25])
+def test_it_may_be_spent_in_parts_that_floats_cannot_hold(steps: int):
+    env = TransformedEnv(CartEnv(Cart(horizon=30), 1, seed=0), Saute(0.25 * steps, penalty=9.0))
+    rewards = played(env, [0.5] * (steps + 1))["next", "reward"].flatten()
+    assert (rewards[:steps] != -9).all() and rewards[steps] == -9
+
+
+def test_an_environment_that_is_wrapped_again_hears_the_switch():
+    saute = Saute(0.01, penalty=7.0)
+    env = TransformedEnv(TransformedEnv(CartEnv(Cart(), 2, seed=0), saute), StepCounter())
+    assert (played(env, [0.4])["next", "reward"] == -7).all()
+    saute.enabled = False
+    assert (played(env, [0.4])["next", "reward"] != -7).all()
+
+
+def test_demonstrations_have_a_budget(tmp_path: Path):
+    """Learned from as what is collected is: as states with what is left, and with the rewards that it learns from."""
+    cfg = compose(
+        *SMALL,
+        "task=gs",
+        "algo=sac",
+        "transform=saute",
+        "learning.demonstrations=300",
+        "learning.buffer_size=400",
+        "cost_limit=0.001",
+    )
+    shown = build_trainer(cfg, tmp_path).experience.demonstrate()
+    budget, after = shown["budgeted"][:, -1:], shown["next", "budgeted"][:, -1:]
+    torch.testing.assert_close(after, budget - shown["next", "cost"] / 0.001)
+    assert (budget == 1).any() and ((after < -1e-5) == (shown["next", "reward"] == -5)).all()
 
 
 def test_in_a_test_the_reward_is_what_was_earned():

@@ -37,15 +37,20 @@ def encoder() -> MLPPolicyEncoder:
     return MLPPolicyEncoder(size=SIZE, width=8, depth=1)
 
 
-def value(key: str):
-    return value_operator(StateValue(encoder(), 8), in_keys=["observation"], out_key=key)
+def value(key: str, features: MLPPolicyEncoder | None = None):
+    network = StateValue(features or encoder(), 8)
+    return value_operator(network, in_keys=["observation"], out_key=key)
 
 
-def build(kind: str = "ppo_lag", seed: int = 0, **settings):
-    """A loss, and its actor as a module that acts."""
+def build(kind: str = "ppo_lag", seed: int = 0, shared: bool = False, **settings):
+    """A loss, and its actor as a module that acts; their networks may share an encoder."""
     torch.manual_seed(seed)
-    actor = tanh_gaussian_actor(encoder(), 8, 2, in_keys=["observation"]).double()
-    parts = actor, value("state_value").double(), value("state_cost_value").double()
+    features = encoder()
+    actor = tanh_gaussian_actor(features, 8, 2, in_keys=["observation"]).double()
+    values = (
+        value(key, features if shared else None) for key in ("state_value", "state_cost_value")
+    )
+    parts = actor, *(each.double() for each in values)
     if kind in MULTIPLIERS:
         settings = {"lagrange": MULTIPLIERS[kind]()} | settings
     loss = LOSSES[kind](*parts, **settings)

@@ -7,7 +7,7 @@ import torch
 from on_policy import GAMMA, LAMBDA, LOSSES, batch_of, build, value
 from torchrl.objectives import ClipPPOLoss, ValueEstimators
 
-from saferl.algorithms.on_policy import before_updates
+from saferl.algorithms.on_policy import begin_of
 from saferl.modules import DualAscent
 
 
@@ -99,8 +99,8 @@ def test_an_unchanged_policy_has_a_ratio_of_one(kind: str, location: float):
     data = batch_of(actor.double()).apply(lambda x: x.float() if x.is_floating_point() else x)
     data = actor.float()(data)
     drawn = data["action_log_prob"]
-    for hook in before_updates(loss.float())[:1]:  # not CPO's step, which changes the policy
-        hook(data)
+    begin = begin_of(loss.float()) if kind == "torchrl" else loss.float().begin  # CPO steps besides
+    begin(data)
     found = actor.get_dist(data).log_prob(data["action"])
     torch.testing.assert_close(data["action_log_prob"], found, rtol=1e-5, atol=1e-4)
     assert torch.allclose(drawn, found, atol=1e-2) == (location == 0.0)
@@ -125,6 +125,34 @@ def test_terms_reach_their_own_parameters(kind: str):
         out[term].backward(retain_graph=True)
         reached = {n.split(".")[0] for n, p in loss.named_parameters() if p.grad is not None}
         assert reached == {owner}
+
+
+@pytest.mark.parametrize("separate", [False, True])
+@pytest.mark.parametrize("kind", LOSSES)
+def test_separate_losses_leave_shared_parameters_to_the_policy(kind: str, separate: bool):
+    loss, actor = build(kind, shared=True, separate_losses=separate)
+    data = batch_of(actor)
+    loss.begin(data)
+    out = loss(data.reshape(-1))
+    policy = [p for name, p in loss.named_parameters() if name.startswith("actor_network_params")]
+    for term in ("loss_critic", "loss_cost"):
+        slopes = torch.autograd.grad(out[term], policy, allow_unused=True, retain_graph=True)
+        assert any(slope is not None for slope in slopes) != separate
+
+
+@pytest.mark.parametrize("kind", LOSSES)
+def test_a_batch_can_be_begun_again(kind: str):
+    """Its advantages are then those of the networks as they are by then."""
+    loss, actor = build(kind)
+    data, fresh = batch_of(actor), batch_of(actor)
+    loss.begin(data)
+    with torch.no_grad():
+        for parameter in loss.cost_critic_params.values(True, True):
+            parameter.add_(0.1)
+    loss.begin(data)
+    loss.begin(fresh)
+    for key in ("advantage", "cost_advantage", "cost_value_target"):
+        torch.testing.assert_close(data[key], fresh[key])
 
 
 @pytest.mark.parametrize("kind", LOSSES)

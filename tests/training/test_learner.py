@@ -51,18 +51,6 @@ def test_the_order_decides_what_a_term_sees(order, after, seen):
     assert calls == [x for value in seen for x in ("targets", value)]
 
 
-def test_a_whole_batch_is_prepared_in_order():
-    loss, _, _ = learner("joint")
-    groups = [{"params": [p], "name": name} for name, p in loss.named_parameters()]
-    hooks = [
-        lambda data: data.set("advantage", 1.0),
-        lambda data: data.set("seen", data["advantage"]),
-    ]
-    one = Learner(loss, torch.optim.SGD(groups), before_updates=hooks)  # type: ignore
-    one.begin(data := TensorDict())
-    assert data["seen"] == 1.0
-
-
 def test_an_unknown_order_is_refused():
     with pytest.raises(ValueError, match="order must be one of joint, sequential, got 'paper'"):
         learner("paper")

@@ -16,6 +16,23 @@ from torchrl.envs.transforms import Transform
 _STASH = "_correction"
 
 
+class Switched:
+    """A switch, ``enabled``, that a transform shares with its clones: TorchRL makes them of the transforms of an environment
+    that is wrapped once more, and whoever holds the first one must still reach what runs."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self._switch = [True]  # no tensor: to ask a GPU would be to wait for it
+
+    @property
+    def enabled(self) -> bool:
+        return self._switch[0]
+
+    @enabled.setter
+    def enabled(self, on: bool) -> None:
+        self._switch[0] = on
+
+
 class Correction(Transform):
     """Base of what executes another action than the proposed one; a subclass says which in :meth:`correct`.
 

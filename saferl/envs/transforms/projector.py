@@ -13,7 +13,7 @@ from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.envs.transforms import Transform
 
-from saferl.envs.transforms.correction import Correction
+from saferl.envs.transforms.correction import Correction, Switched
 from saferl.modules.compiled import Compiled
 from saferl.modules.limits import as_limit
 from saferl.modules.projection import project
@@ -21,7 +21,7 @@ from saferl.modules.projection import project
 _ROWS = 32  # corrected together in compiled code
 
 
-class SafetyProjector(Correction):
+class SafetyProjector(Switched, Correction):
     """Executes a corrected action wherever the risk of the proposed one exceeds a limit; of several risks, where any does.
 
     The correction is :func:`saferl.modules.project` (paper, E8 to E10) on the risk
@@ -130,7 +130,7 @@ class SafetyProjector(Correction):
         if compile:
             self._see = Compiled(self._look, "the projector's look at a state", replay=False)
         self.start = float(start)
-        self.enabled = start == 0.0  # no tensor: to ask a GPU would be to wait for it
+        self.enabled = start == 0.0
 
     @property
     def reads(self) -> Sequence[NestedKey]:

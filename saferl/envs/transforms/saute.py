@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -11,10 +12,14 @@ from torch import Tensor
 from torchrl.data import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
+from saferl.envs.transforms.correction import Switched
 from saferl.modules.limits import as_limit
 
+#: What sums of shares in float32 may be off by: a budget that is spent to the last is not exceeded.
+_ROUNDING = 1e-5
 
-class Saute(Transform):
+
+class Saute(Switched, Transform):
     r"""Observes what is left of an episode's budget, and pays no reward beyond it (Sauté RL).
 
     .. math::
@@ -43,7 +48,8 @@ class Saute(Transform):
     share of each limit that is left, below 0 where it is exceeded; ``budgeted`` [*B, n + K]; while enabled ``reward``.
 
     Raises:
-        ValueError: a limit is not positive, or they are not as many as the environment's costs; ``penalty`` is negative.
+        ValueError: a limit is not positive, or they are not as many as the environment's costs; ``penalty`` is negative or not
+            finite.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -72,11 +78,10 @@ class Saute(Transform):
             raise ValueError(
                 f"cost_limit must be > 0, as costs are counted in shares of it, got {cost_limit}."
             )
-        if not penalty >= 0:
+        if not 0 <= penalty < math.inf:
             raise ValueError(f"penalty must be >= 0, got {penalty}.")
         self.register_buffer("limit", limit)
         self.count, self.penalty = limit.numel(), float(penalty)
-        self.enabled = True
         self.in_key, self.out_key, self.budget_key, self.cost_key, self.reward_key = map(
             unravel_key, (in_key, out_key, budget_key, cost_key, reward_key)
         )
@@ -92,7 +97,7 @@ class Saute(Transform):
         budget = tensordict.get(self.budget_key) - cost / self.limit.to(cost)
         if self.enabled:
             reward = next_tensordict.get(self.reward_key)
-            within = (budget >= 0).all(-1, keepdim=True)
+            within = (budget >= -_ROUNDING).all(-1, keepdim=True)
             next_tensordict.set(self.reward_key, torch.where(within, reward, -self.penalty))
         return self._write(next_tensordict, budget)
 
