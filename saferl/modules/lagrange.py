@@ -97,6 +97,10 @@ class LagrangeMultiplier(nn.Module):
 
     def _mean(self, penalty: Tensor) -> tuple[Tensor, Tensor]:
         """Mean of the finite entries of each constraint (float64), and whether there is one."""
+        if self.count > 1 and penalty.shape[-1:] != self.value.shape:
+            raise ValueError(
+                f"penalty must be [*B, {self.count}] of {self.count} constraints, got {list(penalty.shape)}."
+            )
         penalty = penalty.detach().to(self.value).reshape(-1, *self.value.shape)
         finite = penalty.isfinite()
         total = torch.where(finite, penalty, 0.0).sum(0)
@@ -113,6 +117,9 @@ class LagrangeMultiplier(nn.Module):
         Args:
             penalty: of any shape; of several constraints [*B, K].
             elapsed: since the last update, in the unit of time that rates are of.
+
+        Raises:
+            ValueError: penalties of several constraints have another last size.
         """
 
 

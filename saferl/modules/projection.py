@@ -208,7 +208,7 @@ def project(
 
     Raises:
         ValueError: if ``steps < 0``, ``step_size <= 0``, ``penalty < 0``, ``low >= high``, ``keep``
-            is unknown, ``limit`` is NaN, ``compile`` is set for another risk, or the risk's shape does not
+            is unknown, ``limit`` is a number and NaN (a tensor is not looked at), ``compile`` is set for another risk, or the risk's shape does not
             fit the action's.
         RuntimeError: in inference mode, where nothing can be differentiated.
 

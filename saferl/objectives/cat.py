@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -16,7 +17,7 @@ from torchrl.objectives import ClipPPOLoss, PPOLoss, ValueEstimators
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from saferl.objectives.advantages import score_actions
-from saferl.objectives.checks import check_begun, check_cost, check_limit
+from saferl.objectives.checks import check_begun, check_cost, check_gamma, check_limit
 from saferl.objectives.values import critic_values
 
 
@@ -116,6 +117,10 @@ class CaTLoss(ClipPPOLoss):
         for name, value in (("probability", probability), ("memory", memory)):
             if not 0 <= value <= 1:
                 raise ValueError(f"{name} must be in [0, 1], got {value}.")
+        if not clip_epsilon > 0:
+            raise ValueError(f"clip_epsilon must be > 0, got {clip_epsilon}.")
+        if not math.isfinite(bonus):
+            raise ValueError(f"bonus must be a number, got {bonus}.")
         limit = check_limit("step_limit", step_limit, torch.as_tensor(step_limit).numel())
         super().__init__(
             actor_network,
@@ -136,6 +141,11 @@ class CaTLoss(ClipPPOLoss):
         self.register_buffer("termination", torch.zeros(()))
         self.out_keys = [*self.out_keys, "termination"]
         _ = self.value_estimator  # asked for now, so that a fresh loss loads a state_dict strictly
+
+    def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
+        """As in TorchRL's losses; ValueError if ``gamma`` lies outside [0, 1]."""
+        check_gamma(hyperparams)
+        super().make_value_estimator(value_type, **hyperparams)
 
     @torch.no_grad()
     def terminations(self, cost: Tensor) -> Tensor:

@@ -112,6 +112,11 @@ class FOCOPSLoss(PPOLagLoss):
         return [*super().read_keys(), *self.actor_network[-1].in_keys]
 
     def policy_terms(self, tensordict: TensorDictBase) -> dict[str, Tensor]:
+        for key in self.actor_network[-1].in_keys:
+            if tensordict.get(key, None) is None:
+                raise KeyError(
+                    f"The batch has no entry {key!r}: FOCOPS compares with the distribution that acted."
+                )
         old = self.actor_network.build_dist_from_params(tensordict)
         log_ratio, new = self.log_ratio(tensordict)
         kl = kl_divergence(new, old).unsqueeze(-1)

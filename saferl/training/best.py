@@ -27,7 +27,7 @@ class BestPolicy:
     """Keeps the policy whose last training episodes were the best as ``RUN/best/policy.safetensors``.
 
     Better is whose mean cost is within the limit, if there is one; then what succeeds more often, or, of a task without success,
-    returns more. Episodes that began before the first update do not count; the file says whether the limit is kept (``within``). As training episodes explore, and the best of many means is a lucky one, it is no estimate.
+    returns more. Episodes that ended before the first update do not count; the file says whether the limit is kept (``within``). As training episodes explore, and the best of many means is a lucky one, it is no estimate.
 
     Args:
         run: folder of the run.

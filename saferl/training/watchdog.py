@@ -82,7 +82,7 @@ class Watchdog:
                 continue
             scale = self.reward_scale if kind == "reward" else 1.0
             low, high = (float(end) * scale / (1.0 - self.gamma) for end in self.seen[kind])
-            slack = (TOLERANCE - 1.0) * max(high - low, 1.0) + self._entropy(name)
+            slack = (TOLERANCE - 1.0) * max(high - low, 1.0) + self._bonus(name)
             values = self.values(self.loss, name, data)
             least, most = float(values.amin()), float(values.amax())
             if not (low - slack <= least and most <= high + slack):
@@ -105,8 +105,10 @@ class Watchdog:
         name, frame = min(self.left.items(), key=lambda item: item[1])
         return f" {name} had left its range at frame {frame}."
 
-    def _entropy(self, name: str) -> float:
-        """What the bonus for entropy may add to a reward's value, ten nats for each dimension."""
+    def _bonus(self, name: str) -> float:
+        """What a loss may add to a reward's value: CaT's bonus, or that for entropy, ten nats for each dimension."""
+        if name == "critic_network":
+            return abs(getattr(self.loss, "bonus", 0.0)) / (1.0 - self.gamma)
         log_alpha = getattr(self.loss, "log_alpha", None)
         if name != "qvalue_network" or log_alpha is None:
             return 0.0

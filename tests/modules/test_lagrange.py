@@ -177,6 +177,13 @@ def test_errors(make, message):
         make()
 
 
+@pytest.mark.parametrize("shape", [(4,), (2, 1), ()])
+def test_penalties_of_several_constraints_have_their_number(shape):
+    multiplier = DualAscent(init=1.0).expand(2)
+    with pytest.raises(ValueError, match=r"penalty must be \[\*B, 2\] of 2 constraints, got"):
+        multiplier.update(torch.ones(shape))
+
+
 def controlled(errors, times, **settings):
     """The recursion of an exponential PID multiplier in plain floats."""
     kp, ki, kd, smoothing, swing = (

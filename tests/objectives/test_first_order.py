@@ -276,3 +276,25 @@ def test_cat_refuses():
         loss(batch_of(actor).reshape(-1))
     with pytest.raises(NotImplementedError):
         loss.make_value_estimator(ValueEstimators.TD0, gamma=0.9)
+
+
+def test_focops_needs_the_distribution_that_acted():
+    loss, actor = build("focops")
+    data = samples(loss, actor)
+    with pytest.raises(KeyError, match="no entry 'scale': FOCOPS compares"):
+        loss(data.exclude("scale"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"clip_epsilon": -0.5}, "clip_epsilon must be > 0, got -0.5"),
+        ({"bonus": math.nan}, "bonus must be a number"),
+    ],
+)
+def test_cat_refuses_what_ppo_does(settings, message: str):
+    parts = tanh_gaussian_actor(encoder(), 8, 2, in_keys=["observation"]), value("state_value")
+    with pytest.raises(ValueError, match=message):
+        CaTLoss(*parts, **settings)
+    with pytest.raises(ValueError, match=r"gamma must be in \[0, 1\], got 2.0"):
+        CaTLoss(*parts).make_value_estimator(gamma=2.0)

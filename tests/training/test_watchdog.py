@@ -54,6 +54,17 @@ def test_the_range_is_that_of_what_was_collected(tmp_path: Path):
     assert not dog.left
 
 
+def test_the_bonus_of_a_loss_is_no_divergence(tmp_path: Path):
+    """CaT's value of a reward of -0.2 and a bonus of 1, for ever."""
+    trainer = trainer_of(tmp_path, "algo=cat", "loss.bonus=1.0", "gamma=0.99")
+    dog, (data,) = trainer.watchdog, collect(trainer, 1)
+    dog.seen = {"reward": torch.tensor([-0.2, 0.0])}
+    for value, left in ((80.0, {}), (250.0, {"critic_network": 7})):
+        dog.values = lambda *_, value=value: torch.tensor([value])
+        dog.look(data, 7)
+        assert dog.left == left
+
+
 def test_a_divergence_says_which_critic_left_first(tmp_path: Path):
     trainer = trainer_of(tmp_path, "algo=rsac", "frames=1000")
     trainer.save()
