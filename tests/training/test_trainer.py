@@ -118,8 +118,8 @@ def test_an_epoch_leaves_its_rest(tmp_path: Path):
 
 
 def test_threads_are_as_many_as_are_asked_for(tmp_path: Path):
-    """Two by default, not all that a machine has (docs/pitfalls.md, 14)."""
-    assert compose().threads == 2
+    """One by default, not all that a machine has (docs/pitfalls.md, 14)."""
+    assert compose().threads == 1
     for threads in (2, 1):
         trainer_of(tmp_path, "algo=sac", f"threads={threads}")
         assert torch.get_num_threads() == threads
