@@ -22,13 +22,13 @@ from saferl.config.check import check
 from saferl.config.limits import check_limits
 from saferl.config.space import Dimension
 from saferl.evaluation.compare import TESTED, finished, side_by_side
+from saferl.evaluation.costs import limits, names
 from saferl.training.trainer import Trainer
 
 log = logging.getLogger(__name__)
 
 #: How often a trial is looked at while it trains; the first quarter is never cut short.
 LOOKS = 20
-_COST = "cost over its limit"
 #: Below every return that keeps the limit.
 _OVER = 1e12
 
@@ -42,16 +42,24 @@ def judged(figures: Mapping[str, float]) -> float:
     return figures.get("success_rate", figures["return"])
 
 
-def rank(figures: Mapping[str, float], limit: float | None) -> float:
-    """One number for the pruner: within the limit :func:`judged`, else below all of these, and the lower the more it costs.
+def beyond(figures: Mapping[str, float], limit: Any, costs: Sequence[str]) -> dict[str, float]:
+    """By how much the mean of each cost that has a limit exceeds it, by the figure's name; not above 0 where it is kept.
 
-    >>> within, over = {"return": -9.0, "cost_return": 0.1}, {"return": 5.0, "cost_return": 0.3}
-    >>> rank(within, 0.2) > rank(over, 0.2), rank(over, None)
-    (True, 5.0)
+    >>> beyond({"cost_return": 0.5}, 0.25, ["cost"]), beyond({"cost_return": 0.3}, None, ["cost"])
+    ({'cost_return': 0.25}, {})
     """
-    if limit is None or figures["cost_return"] <= limit:
-        return judged(figures)
-    return -_OVER * (1.0 + figures["cost_return"] - limit)
+    each = zip(names("cost_return", costs), limits(limit, costs), strict=True)
+    return {name: figures[name] - most for name, most in each if most is not None}
+
+
+def rank(figures: Mapping[str, float], excess: Mapping[str, float]) -> float:
+    """One number for the pruner: within the limits :func:`judged`, else below all of these, and the lower the more it costs.
+
+    >>> rank({"return": -9.0}, {"cost_return": -0.1}) > rank({"return": 5.0}, {"cost_return": 0.1})
+    True
+    """
+    most = max(excess.values(), default=0.0)
+    return judged(figures) if most <= 0 else -_OVER * (1.0 + most)
 
 
 class Search:
@@ -74,8 +82,7 @@ class Search:
                 values = {each.key: each.ends[0] for each in space} | {dimension.key: end}
                 overrides = self.overrides(values)
                 cfg = compose(overrides)
-                complete(cfg.task)
-                check_limits(cfg, overrides)
+                check_limits(cfg, overrides, complete(cfg.task).costs)
                 check(cfg)
                 build_agent(cfg)
         optuna.logging.set_verbosity(optuna.logging.WARNING)
@@ -155,16 +162,16 @@ class Search:
             return
         told = json.loads((run / TESTED).read_text(encoding="utf-8"))
         figures = {k: v["mean"] for k, v in told.items() if isinstance(v, dict) and "mean" in v}
-        self._limit(trial, figures, cfg.cost_limit)
+        self._limit(trial, figures, cfg.cost_limit, complete(cfg.task).costs)
         self.study.tell(trial, judged(figures))
 
     def _limit(
-        self, trial: optuna.Trial, figures: Mapping[str, float], limit: float | None
+        self, trial: optuna.Trial, figures: Mapping[str, float], limit: Any, costs: Sequence[str]
     ) -> None:
-        """Tell optuna whether the cost keeps its limit: it prefers every trial that does to those that do not."""
-        trial.set_user_attr("cost", figures["cost_return"])
-        if limit is not None:
-            trial.set_constraint(_COST, figures["cost_return"] - limit)
+        """Tell optuna at the end of a trial whether its costs keep their limits: it prefers every trial whose do."""
+        trial.set_user_attr("cost", [figures[name] for name in names("cost_return", costs)])
+        for name, value in beyond(figures, limit, costs).items():
+            trial.set_constraint(name, value)  # once: optuna takes no other value
 
     def _watch(self, trainer: Trainer, trial: optuna.Trial) -> None:
         """Let the pruner look at the last training episodes now and then."""
@@ -178,10 +185,10 @@ class Search:
             if not math.isfinite(figures.get("return", math.nan)):
                 return
             seen.add(number)
-            limit = trainer.watch.limit
-            self._limit(trial, figures, limit)
-            trial.report(rank(figures, limit), number)
+            limit, costs = trainer.watch.limit, trainer.costs
+            trial.report(rank(figures, beyond(figures, limit, costs)), number)
             if trial.should_prune():
+                self._limit(trial, figures, limit, costs)
                 raise optuna.TrialPruned
 
         trainer.after_collect.append(look)
@@ -205,8 +212,7 @@ class Search:
             how = {TrialState.PRUNED: "cut short", TrialState.FAIL: "failed"}.get(trial.state)
             how = how or ("over" if over else "")
             value = "" if trial.state is not TrialState.COMPLETE else f"{trial.value:.4g}"
-            cost = trial.user_attrs.get("cost")
-            cost = "" if cost is None else f"{cost:.4g}"
+            cost = " ".join(f"{each:.4g}" for each in trial.user_attrs.get("cost", ()))
             lines.append(
                 f"{trial.number:>5}  {value:>8}  {cost:>8}  {how:<9}  {_shown(trial.params)}"
             )

@@ -98,7 +98,7 @@ def test_the_best_trial_is_the_best_that_keeps_the_limit(closed_form: Cart, caps
     reward, _ = closed_form.sums(best, 1.0, closed_form.horizon)
     (found, *_), told = trials_by_value(0.3), capsys.readouterr().out
     assert reward * 1.05 < found.value <= reward + 1e-6
-    over = [t for t in trials() if t.user_attrs["cost"] > 0.3]
+    over = [t for t in trials() if t.user_attrs["cost"] > [0.3]]
     assert over and max(t.value for t in over) > found.value  # these are not taken
     lines = told[told.index("trial ") :].splitlines()
     assert lines[1].split()[0] == str(found.number) and "over" not in lines[1]
@@ -107,7 +107,7 @@ def test_the_best_trial_is_the_best_that_keeps_the_limit(closed_form: Cart, caps
 
 
 def trials_by_value(limit: float) -> list[optuna.trial.FrozenTrial]:
-    within = [t for t in trials() if t.user_attrs["cost"] <= limit]
+    within = [t for t in trials() if t.user_attrs["cost"] <= [limit]]
     return sorted(within, key=lambda t: -t.value)
 
 
@@ -117,19 +117,22 @@ def test_a_trial_behind_the_others_is_cut_short(monkeypatch: pytest.MonkeyPatch,
 
     def train_into(run: Path, cfg: Any, overrides: Any, prepare: Any) -> None:
         number = next(count)
-        cost = 1.0 if number == 8 else 0.0
+        cost = 1.0 if number == 8 else 0.1
         figures = {"return": float(number), "cost_return": cost}
         trainer = SimpleNamespace(
             after_collect=[],
             progress=SimpleNamespace(updates=1),
             window=SimpleNamespace(summary=lambda: figures),
             watch=SimpleNamespace(limit=0.2),
+            costs=["cost"],
         )
         prepare(trainer)
         for step in (1, 4, 8, 12, 20):
             trainer.after_collect[0]({}, step / 20)
         (run / "evaluation").mkdir(parents=True)
-        told = {name: {"mean": value} for name, value in figures.items()}
+        told = {name: {"mean": value} for name, value in figures.items()} | {
+            "cost_return": {"mean": 0.0}
+        }
         (run / "evaluation/metrics.json").write_text(json.dumps(told))
 
     monkeypatch.setattr(searching, "train_into", train_into)
@@ -137,7 +140,8 @@ def test_a_trial_behind_the_others_is_cut_short(monkeypatch: pytest.MonkeyPatch,
     *others, last = trials()
     assert [t.state for t in others] == [TrialState.COMPLETE] * 8
     assert last.state is TrialState.PRUNED
-    assert list(last.intermediate_values) == [1, 4, 8] and last.user_attrs["cost"] == 1.0
+    assert list(last.intermediate_values) == [1, 4, 8] and last.user_attrs["cost"] == [1.0]
+    assert {t.constraints["cost_return"] for t in others} == {-0.2}  # the closing test's
     assert "cut short" in capsys.readouterr().out
 
 
@@ -175,3 +179,25 @@ def test_a_search_goes_on_where_it_was_interrupted(monkeypatch: pytest.MonkeyPat
     assert len(calls) == 3 and torch.get_num_threads() == 1
     with pytest.raises(SystemExit, match="holds a search with other settings"):
         main([*asked, "gamma=0.9"])
+
+
+def test_several_costs_have_a_limit_each(monkeypatch: pytest.MonkeyPatch, capsys):
+    """The second trial earns more, and its motion costs more than it may."""
+    costs = iter([(0.1, 0.2), (0.1, 0.4)])
+
+    def train_into(run: Path, cfg: Any, overrides: Any, prepare: Any) -> None:
+        effort, motion = next(costs)
+        figures = {"return": motion, "cost_return_effort": effort, "cost_return_motion": motion}
+        (run / "evaluation").mkdir(parents=True)
+        told = {name: {"mean": value} for name, value in figures.items()}
+        (run / "evaluation/metrics.json").write_text(json.dumps(told))
+
+    monkeypatch.setattr(searching, "train_into", train_into)
+    two = ("task.costs=[effort,motion]", "cost_limit=[0.2,0.3]")
+    main([*CART, *two, TAU, "--trials", "2"])
+    assert [trial.constraints for trial in trials()] == [
+        pytest.approx({"cost_return_effort": -0.1, "cost_return_motion": each})
+        for each in (-0.1, 0.1)
+    ]
+    out = capsys.readouterr().out
+    assert out[out.index("trial ") :].splitlines()[1].split()[:4] == ["0", "0.2", "0.1", "0.2"]
