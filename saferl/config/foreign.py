@@ -31,8 +31,9 @@ def check_origin(settings: Any, path: Path) -> None:
     """Refuse what a file could run code by, or write outside its folder, before anything is built.
 
     It may name classes of saferl, TorchRL and ``torch.nn``, and classes and functions of one's own modules: those that are neither
-    Python's nor installed nor lie beside the file, or that the environment variable ``SAFERL_TRUST`` names. It may look
-    nothing up, as a run's file is written without interpolations.
+    Python's nor installed nor came with the file, or that the environment variable ``SAFERL_TRUST`` names. An environment
+    (``task.id``) may be of an installed package, too. It may look nothing up, as a run's file is written without
+    interpolations.
 
     Args:
         settings: of the file, plain mappings and lists.
@@ -62,10 +63,14 @@ def check_origin(settings: Any, path: Path) -> None:
                 )
         elif name == "task.id":
             module = str(value).rpartition(":")[0].partition(".")[0]
-            if module in sys.stdlib_module_names:
-                raise ValueError(f"{path}: {name} imports {module!r}, which a file may not.")
-        elif (name in _FOLDERS or name.startswith("logger.")) and set(str(value)) & {"/", "\\"}:
-            raise ValueError(f"{path}: {name} must be without / and \\, got {value!r}.")
+            if module and not _elsewhere(module, path.parent):
+                raise ValueError(
+                    f"{path}: {name} imports {module!r}, which a file may not. If the file is yours, say so: {TRUST}={module}."
+                )
+        elif (name in _FOLDERS or name.startswith("logger.")) and (
+            set(str(value)) & {"/", "\\"} or value in (".", "..")
+        ):
+            raise ValueError(f"{path}: {name} must be a name without / and \\, got {value!r}.")
 
 
 def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -77,6 +82,31 @@ def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
         yield from _leaves(below, f"{prefix}.{key}".removeprefix("."))
 
 
+def _elsewhere(package: str, folder: Path) -> bool:
+    """Whether a package is trusted, or neither Python's nor came with a file.
+
+    Args:
+        package: its name.
+        folder: of the file, whose author's are the modules below it and the packages around it. A folder without an
+            ``__init__.py`` counts as such, too, as it may be anybody's.
+    """
+    if package in os.environ.get(TRUST, "").split(","):
+        return True
+    if package in sys.stdlib_module_names:
+        return False
+    try:
+        spec = importlib.util.find_spec(package)
+    except (ImportError, ValueError):
+        return False
+    if spec is None:  # it is told when it is imported
+        return True
+    if spec.origin is None:
+        return False
+    place, folder = Path(spec.origin).resolve(), folder.resolve()
+    around = place.name == "__init__.py" and place.parent in (folder, *folder.parents)
+    return not around and folder not in place.parents
+
+
 def _own(target: str, folder: Path) -> bool:
     """Whether a name is of a module of one's own, and was not merely imported into it.
 
@@ -85,20 +115,11 @@ def _own(target: str, folder: Path) -> bool:
         folder: of the file that says it, whose own modules are its author's.
     """
     package = target.partition(".")[0]
-    trusted = package in os.environ.get(TRUST, "").split(",")
-    if not trusted:
-        if package in sys.stdlib_module_names or package == "saferl":
-            return False
-        try:
-            spec = importlib.util.find_spec(package)
-        except (ImportError, ValueError):
-            return False
-        if spec is None or spec.origin is None:
-            return False
-        place = Path(spec.origin).resolve()
-        if {"site-packages", "dist-packages"} & set(place.parts):
-            return False
-        if folder.resolve() in place.parents:
+    if package == "saferl" or not _elsewhere(package, folder):
+        return False
+    if package not in os.environ.get(TRUST, "").split(","):
+        spec = importlib.util.find_spec(package)
+        if spec is None or {"site-packages", "dist-packages"} & set(Path(str(spec.origin)).parts):
             return False
     try:
         found = hydra.utils.get_object(target)

@@ -47,7 +47,11 @@ EVIL = [
     ("encoder.activation", {"_target_": "hydra.utils.get_class", "_args_": ["antigravity.X"]}),
     ("logger.sinks", [{"_target_": "torchrl.record.loggers.CSVLogger", "exp_name": "${init}"}]),
     ("task.id", "antigravity:X-v0"),
+    ("task.id", "their_folder.evil:X-v0"),
+    ("task.id", "policy.evil:X-v0"),
     ("algo_name", "../../x"),
+    ("algo_name", ".."),
+    ("task.task", "."),
     ("task.task", "../x"),
     ("logger.sinks", [{"_target_": "os.system", "command": "x"}]),
     ("logger.sinks", [{"_target_": "torchrl.record.loggers.CSVLogger", "exp_name": "../../x"}]),
@@ -65,8 +69,11 @@ def test_a_configuration_names_parts_alone(
     cfg = OmegaConf.load(theirs / CONFIG)
     OmegaConf.update(cfg, name, value, force_add=True)
     (tmp_path / "policy").mkdir()
+    for folder in ("policy", "their_folder"):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        (tmp_path / folder / "evil.py").write_text("raise SystemExit('it ran')\n")
     OmegaConf.save(cfg, tmp_path / "policy" / CONFIG)
-    with pytest.raises(ValueError, match=r"may not|must be without"):
+    with pytest.raises(ValueError, match=r"may not|must be a name without"):
         run_config(tmp_path / "policy", option)
 
 
@@ -90,6 +97,23 @@ def test_modules_beside_a_file_are_its_authors(
     OmegaConf.save(cfg, tmp_path / CONFIG)
     with pytest.raises(ValueError, match="may not call"):
         run_config(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["task.id", "risk._target_"])
+def test_a_package_around_a_file_is_its_authors(
+    name: str, theirs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """An archive that brings a package with a run in it."""
+    (tmp_path / "their_pack/run").mkdir(parents=True)
+    for file in ("__init__.py", "evil.py"):
+        (tmp_path / "their_pack" / file).write_text("raise SystemExit('it ran')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    cfg = OmegaConf.load(theirs / CONFIG)
+    value = "their_pack.evil:Part-v0" if name == "task.id" else "their_pack.evil.Part"
+    OmegaConf.update(cfg, name, value, force_add=True)
+    OmegaConf.save(cfg, tmp_path / "their_pack/run" / CONFIG)
+    with pytest.raises(ValueError, match="which a file may not"):
+        run_config(tmp_path / "their_pack/run")
 
 
 def test_a_run_whose_files_are_links_does_not_go_on(theirs: Path, tmp_path: Path, refusal):
