@@ -214,14 +214,18 @@ def progress(path: Path) -> dict[str, int]:
 
 
 def check_free(folder: Path) -> None:
-    """Refuse a folder that an exported policy would destroy.
+    """Refuse a folder that an exported policy and its card would destroy.
 
     Raises:
-        ValueError: it holds a run or a policy already.
+        ValueError: it holds a run, a policy or a ``README.md`` already.
     """
     held = any((folder / name).exists() for name in (FOLDER, "metrics.csv"))
     if held or any(folder.glob("policy.*")):
         raise ValueError(f"out: {folder} holds a run or a policy already; take another folder.")
+    if (folder / "README.md").exists():
+        raise ValueError(
+            f"out: {folder} holds a README.md, which the policy's would replace; take another folder."
+        )
 
 
 def export(path: Path, folder: Path, project: bool = True) -> Path:

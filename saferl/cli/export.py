@@ -36,7 +36,7 @@ def export(cfg: DictConfig) -> None:
         run.latest(source)
         file = out / f"policy.{cfg.format}"
         about = package(source, file, cfg.project, cfg.observation)
-    card(source, file, about)
+    card(source, file, about, cfg.project)
     size = file.stat().st_size / 2**20
     log.info("%s: %.2f MiB. Its card: %s", file, size, out / "README.md")
     if about is not None:

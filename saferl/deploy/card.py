@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 
 from saferl.checkpoint.policy import EXPORTED
 from saferl.checkpoint.run import progress, run_config
-from saferl.evaluation.statistics import FIGURES, span
+from saferl.evaluation.statistics import FIGURES, each_cost, short, span
 
 CARD = "README.md"
 _USE = {
@@ -40,13 +40,16 @@ Any road. It has seen a simulation and its exact states in place of a sensor's. 
 """
 
 
-def card(source: Path, file: Path, about: Mapping[str, Any] | None = None) -> Path:
+def card(
+    source: Path, file: Path, about: Mapping[str, Any] | None = None, project: bool = True
+) -> Path:
     """Write the card of a file into its folder.
 
     Args:
         source: the run, checkpoint or policy that it was made of; what its own card or its closing test tells is taken over.
         file: of the policy.
         about: what :func:`saferl.deploy.package.package` says of it; None for a ``policy.safetensors``.
+        project: whether the file has the projector of the source; if not, tests of both tell nothing of it.
 
     Returns:
         ``README.md``.
@@ -66,8 +69,13 @@ def card(source: Path, file: Path, about: Mapping[str, Any] | None = None) -> Pa
     text += ["", "```python", use.strip(), "```", ""]
     if about is not None:
         text += _interface(about)
-    told = source / CARD
-    if told.is_file() and (found := told.read_text(encoding="utf-8").find("## Trained")) >= 0:
+    told, alone = source / CARD, not project and cfg.projector._target_ is not None
+    if alone:
+        note = (
+            "Not without its projector: `python -m saferl.evaluate checkpoint=... project=false`."
+        )
+        text += [*_trained(source, cfg), "## Tested", "", note, "", _CAUTION]
+    elif told.is_file() and (found := told.read_text(encoding="utf-8").find("## Trained")) >= 0:
         text += [told.read_text(encoding="utf-8")[found:].split("\n## Checksum")[0].rstrip(), ""]
     else:
         text += [*_trained(source, cfg), *_tested(source), _CAUTION]
@@ -123,10 +131,9 @@ def _tested(source: Path) -> list[str]:
         "",
     ]
     lines += ["| figure | mean | |", "|---|---|---|"]
-    for name, (short, _) in FIGURES.items():
-        if name in metrics:
-            value, share = metrics[name], name.endswith("_rate")
-            scale = 100.0 if share else 1.0
-            interval = span(value["low"], value["high"], ".2f", scale)
-            lines.append(f"| {short}{' %' * share} | {value['mean'] * scale:.2f} | {interval} |")
+    for name in (name for figure in FIGURES for name in each_cost(figure, metrics)):
+        value, share = metrics[name], name.endswith("_rate")
+        scale = 100.0 if share else 1.0
+        interval = span(value["low"], value["high"], ".2f", scale)
+        lines.append(f"| {short(name)}{' %' * share} | {value['mean'] * scale:.2f} | {interval} |")
     return [*lines, ""]

@@ -115,6 +115,11 @@ def test_the_command(command, refusal, tmp_path: Path, small: Path):
     assert saferl.load_policy(tmp_path / "alone").projector is None
     text = (tmp_path / "alone/README.md").read_text()
     assert "# alone" in text and "## Tested" in text and text.count("## Checksum") == 1
+    assert "Not without its projector" in text and "98.3" not in text
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/README.md").write_text("precious")
+    assert "out: mine holds a README.md" in refusal(*export, "pretrained=arsac", "out=mine")
+    assert (tmp_path / "mine/README.md").read_text() == "precious"
     line = refusal(*export, f"checkpoint={small}", "out=alone", "format=pt2")
     assert "out: alone holds a run or a policy already" in line
     command(*export, "checkpoint=alone", "out=pt2", "format=pt2")
