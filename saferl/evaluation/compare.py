@@ -48,9 +48,9 @@ def finished(folders: Sequence[Path]) -> list[tuple[Mapping, Mapping]]:
     """Configuration and figures of every run below these folders whose closing test is over."""
     from saferl.checkpoint.run import CONFIG  # late: help and most mistakes need no torch
 
-    tests = [test for folder in folders for test in folder.glob(f"**/{TESTED}")]
+    tests = {test.resolve() for folder in folders for test in folder.glob(f"**/{TESTED}")}
     return [
-        (OmegaConf.to_container(OmegaConf.load(config)), _figures(test))  # pyright: ignore
+        (_settings(config), _figures(test))
         for test in sorted(tests, key=lambda path: (len(str(path)), path))  # 2 before 10
         if (config := test.parents[1] / CONFIG).is_file()
     ]
@@ -73,6 +73,16 @@ def measured_below(folders: Sequence[Path]) -> list[Mapping]:
 
 def _age(path: Path) -> tuple[int, str]:
     return path.stat().st_mtime_ns, str(path)
+
+
+def _settings(path: Path) -> Mapping:
+    try:
+        config: Any = OmegaConf.to_container(OmegaConf.load(path))
+    except Exception as error:  # of the YAML parser's own kinds
+        raise ValueError(f"{path} is damaged: {' '.join(str(error).split())}") from error
+    if not isinstance(config, Mapping) or not config.keys() >= {"algo_name", "task", "seed"}:
+        raise ValueError(f"{path} is damaged: it holds no run's settings.")
+    return config
 
 
 def _figures(test: Path) -> Mapping:
@@ -112,10 +122,10 @@ def side_by_side(runs: Sequence[tuple[Mapping, Mapping]], columns: Sequence[str]
         Means with 95% intervals: over seeds (Student's t, wide for few; of rates never narrower than Wilson's of
         all their episodes), of a single seed over its episodes.
     """
-    groups: dict[tuple[str, ...], list[Mapping]] = {}
-    for name, (_, figures) in zip(names([config for config, _ in runs]), runs, strict=True):
-        groups.setdefault((name,), []).append(figures)
-    rows = {(*name, str(len(tests))): tests for name, tests in groups.items()}
+    groups: dict[str, dict[Any, Mapping]] = {}  # by seeds: what is repeated says nothing new
+    for name, (config, figures) in zip(names([config for config, _ in runs]), runs, strict=True):
+        groups.setdefault(name, {})[config.get("seed")] = figures
+    rows = {(name, str(len(seeds))): [*seeds.values()] for name, seeds in groups.items()}
     return _laid_out(("", "runs"), rows, columns)
 
 
@@ -128,7 +138,7 @@ def conditions_side_by_side(tests: Sequence[Mapping]) -> str:
     Returns:
         The settings in which the tests differ, unless those before them in the row tell them; scripted drivers stand first;
         rates with intervals as in :func:`side_by_side`, or return and cost where there are none. What one test
-        repeats of another (a policy has no projector to leave out) counts once.
+        repeats of another (a policy has no projector to leave out; a shorter test, the same episodes) counts once.
     """
     from saferl.evaluation.statistics import is_figure
 
@@ -142,7 +152,11 @@ def conditions_side_by_side(tests: Sequence[Mapping]) -> str:
         new = len({*told([*heads, key])}) > len({*told(heads)})
         if new and key not in (*REPETITION, "episodes"):
             heads.append(key)
-    once = dict(zip(map(str, settings), range(len(tests)), strict=True))
+    once: dict[str, int] = {}
+    for k, each in enumerate(settings):
+        same = str({key: value for key, value in each.items() if key != "episodes"})
+        if tests[k]["episodes"] >= tests[once.get(same, k)]["episodes"]:
+            once[same] = k
     policies = list(dict.fromkeys(each["policy"] for each in settings))
     policies.sort(key=lambda policy: " (" in policy)  # of a checkpoint
     groups: dict[tuple[str, ...], list[Mapping]] = {}

@@ -31,7 +31,7 @@ _ROAD = "saferl.envs.intersection.Scenario"
 #: What may differ between repetitions: it changes where, how fast or how often something is done, and no result.
 _FREE = (*REPETITION, *MADE, "record_every", "collector")
 #: What systems that are compared have in common: the task, but for a reward of their own in training, and the test.
-_COMMON = ("task", "evaluation.episodes")
+_COMMON = ("task", "env._target_", "env.drivers", "evaluation.episodes")
 #: And those of a family, off-policy or on-policy: an update of one is dearer than of the other.
 _BUDGET = ("frames", "episodes")
 _OWN = "task.reward.risk_shaping"
@@ -116,13 +116,24 @@ def look(folder: Path) -> Run:
             )
         played = json.loads((folder / TESTED).read_text(encoding="utf-8"))["episodes"]
         test = read_test((folder / TESTED).with_name("episodes.csv"), played)
-        return Run(
-            folder, FINISHED, "", settings, test, read(folder / CURVE), read(folder / TIMING)
-        )
+        curve, timing = (_numbers(folder / name) for name in (CURVE, TIMING))
+        return Run(folder, FINISHED, "", settings, test, curve, timing)
     except KeyError as error:
         return Run(folder, BROKEN, f"{TESTED} names no {error}", settings)
     except (ValueError, TypeError, OSError) as error:
         return Run(folder, BROKEN, " ".join(str(error).split()), settings)
+
+
+def _numbers(path: Path) -> dict[str, np.ndarray]:
+    """The columns of a file of numbers.
+
+    Raises:
+        ValueError: one holds something else.
+    """
+    columns = read(path)
+    if wrong := [name for name, column in columns.items() if column.dtype.kind not in "biuf"]:
+        raise ValueError(f"{path} is damaged: its column {wrong[0]} must hold numbers.")
+    return columns
 
 
 def read_test(path: Path, played: int) -> list[np.ndarray]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from saferl.algorithms.assemble import build_env
 from saferl.algorithms.policy import compiling, trained_agent
-from saferl.checkpoint.run import latest, run_config
+from saferl.checkpoint.run import FOLDER, latest, run_config
 from saferl.envs.intersection import Scenario
 from saferl.envs.intersection.true_scene import TrueScene
 from saferl.evaluation.play import envs_at_once
@@ -51,8 +51,13 @@ def made(runs: Sequence[Run], count: int, out: Path, drivers: Path) -> list[Trac
         out: folder of the traces.
         drivers: folder of the drivers' tests.
     """
-    finished = [run for run in runs if run.state == FINISHED]
-    if not finished or count < 1:
+    finished = [run for run in runs if run.state == FINISHED and (run.folder / FOLDER).is_dir()]
+    if count < 1:
+        return []
+    if not finished:
+        log.warning(
+            "Nothing is played: no finished run has its checkpoint, as published numbers have not."
+        )
         return []
     seeds = [run.seed for run in finished]
     seed = max(sorted(set(seeds)), key=seeds.count)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from saferl.checkpoint.run import CONFIG
 from saferl.evaluation.compare import conditions_side_by_side as table
+from saferl.evaluation.compare import finished, side_by_side
 from saferl.evaluation.compare import measured_below as below
 from saferl.evaluation.statistics import wilson
 
@@ -74,6 +77,34 @@ def test_seeds_are_taken_together_and_a_repetition_counts_once():
     head, row = cells(table([*tests, played("blind", 9)]))[0::2]
     assert head[0].strip() == "policy" and [each.strip() for each in row[:2]] == ["sac (x)", "100"]
     assert row[2].strip().startswith("4.0 [")
+
+
+def test_a_shorter_test_of_the_same_episodes_counts_no_further():
+    """The first three of six are these three."""
+    tests = [played("sac (x)", 1, episodes=3), played("sac (x)", 3, episodes=6), played("blind", 9)]
+    _, _, row = cells(table(tests))
+    assert [each.strip() for each in row[:2]] == ["sac (x)", "6"]
+
+
+def test_a_run_counts_once_however_often_it_is_found(tmp_path: Path):
+    for place, seed in (("a/one", 0), ("a/two", 1), ("b/again", 1)):
+        folder = tmp_path / place
+        (folder / "evaluation").mkdir(parents=True)
+        (folder / CONFIG).write_text(f"algo_name: sac\ntask: {{task: gs}}\nseed: {seed}\n")
+        (folder / "evaluation/metrics.json").write_text(json.dumps(played("sac", 5)))
+    runs = finished([tmp_path, tmp_path / "a"])
+    assert len(runs) == 3
+    _, row = cells(side_by_side(runs))
+    assert row[1].strip() == "2"
+
+
+@pytest.mark.parametrize("text", ["a: [1", "", "seed: 0\n"])
+def test_settings_that_are_damaged_are_told(text: str, tmp_path: Path):
+    (tmp_path / "evaluation").mkdir()
+    (tmp_path / "evaluation/metrics.json").write_text("{}")
+    (tmp_path / CONFIG).write_text(text)
+    with pytest.raises(ValueError, match=f"{tmp_path / CONFIG} is damaged"):
+        finished([tmp_path])
 
 
 def test_measured_below_a_folder_are_all_but_those_that_close_a_run(tmp_path: Path):

@@ -61,6 +61,8 @@ def test_damage_is_told_with_its_file(tmp_path: Path):
     damage("columns", "evaluation/episodes.csv", "episode,route\n0,lt\n")
     damage("curve", "metrics.csv", "frames,return\n")
     damage("timing", "timing.csv", None)
+    damage("word", "metrics.csv", "frames,return\n1,good\n")
+    damage("clock", "timing.csv", "frames,learn\n1,long\n")
     (tmp_path / "refused").mkdir()
     (tmp_path / "refused/error.txt").write_text("seed must be a whole number, got 0.5.\n")
     found = states(tmp_path)
@@ -75,6 +77,8 @@ def test_damage_is_told_with_its_file(tmp_path: Path):
     assert "each row must have 7 cells" in told["cut"] and f"{EPISODES} episodes" in told["few"]
     assert "'uturn'" in told["route"] and "no column collision" in told["columns"]
     assert "metrics.csv" in told["curve"] and "timing.csv" in told["timing"]
+    assert "column return must hold numbers" in told["word"]
+    assert "column learn must hold numbers" in told["clock"]
 
 
 def test_what_does_not_go_with_the_rest_is_foreign(tmp_path: Path):
@@ -90,6 +94,7 @@ def test_what_does_not_go_with_the_rest_is_foreign(tmp_path: Path):
     make(tmp_path / "narrow", "arsac", 7, options=["encoder.width=48"])
     make(tmp_path / "twice", "arsac", 1)
     make(tmp_path / "cart", "sac", options=["task=cart"])
+    make(tmp_path / "slow", "sac_lag", options=["env=highway"])
     found = states(tmp_path)
     own = {"own0", "own1", "own2", "sac", "shaped", "ppo"}
     assert {name for name, (state, _) in found.items() if state == FINISHED} == own
@@ -101,6 +106,7 @@ def test_what_does_not_go_with_the_rest_is_foreign(tmp_path: Path):
     assert "encoder.width=48 (others of its algorithm have" in told["narrow"]
     assert told["twice"] == f"it repeats seed 1 of arsac, which is {tmp_path / 'own1'}"
     assert told["cart"] == "task=cart is not the road"
+    assert told["slow"].startswith("env._target_=saferl.envs.intersection.HighwayIntersection (the")
     assert len(found) == len(told) + len(own) and len(STATES) == 5
 
 

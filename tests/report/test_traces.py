@@ -57,6 +57,11 @@ def test_each_system_plays_the_same_episodes_again(command, tmp_path: Path, caps
     capsys.readouterr()
     main(["paper", "--out", "report", "--play", "3"])
     assert "SAC plays 3 episodes again." in capsys.readouterr().out
+    main(["paper", "--numbers", "published"])
+    capsys.readouterr()
+    main(["published", "--out", "second", "--play", "3"])  # without checkpoints
+    assert "Nothing is played: no finished run has its checkpoint" in capsys.readouterr().out
+    assert (tmp_path / "second/report.html").is_file()
     with pytest.raises(SystemExit, match="--play must be >= 0, got -1"):
         main(["paper", "--play", "-1"])
 
