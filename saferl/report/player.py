@@ -28,7 +28,8 @@ from saferl.evaluation.crashes import way
 from saferl.evaluation.trace import Trace
 from saferl.report.systems import LABELS
 
-#: Columns of the rows of a trace, and how many of them make a unit: they are stored as 16-bit integers.
+#: Columns of the rows of a trace, and how many of them make a unit, fewer where they would not fit: they are stored as 16-bit
+#: integers.
 SCALES = {
     "ego": (100, 100, 100, 100, 10_000, 1000),
     "vehicles": (100, 100, 100, 100, 10_000, 1000),
@@ -45,6 +46,7 @@ SCALES = {
     "nearest": 1,
     "observed": 1,
     "priority": 1,
+    "vehicle_route": 1,
     "intervened": 1,
 }
 #: What stands for "not there".
@@ -64,7 +66,10 @@ def packed(trace: Trace) -> dict[str, Any]:
         if isinstance(scale, tuple) and len(scale) == 6:  # a state's heading
             values = values.copy()
             values[..., 4] = np.remainder(values[..., 4] + np.pi, 2 * np.pi) - np.pi
-        scaled = np.round(values * np.asarray(scale)).clip(-32767, 32767)
+        axes = tuple(range(values.ndim - np.ndim(scale)))
+        most = np.nan_to_num(np.abs(values), posinf=0.0).max(axes, initial=1e-9)
+        scale = np.minimum(scale, 32767 / most)
+        scaled = np.round(values * scale).clip(-32767, 32767)
         whole = np.where(np.isnan(scaled), NOTHING, scaled).astype(np.int16)
         columns.append(whole.reshape(len(values), -1).T)
         layout.append([name, list(shape), np.atleast_1d(scale).tolist()])
@@ -74,10 +79,7 @@ def packed(trace: Trace) -> dict[str, Any]:
     return {
         "about": {**trace.about, "label": _label(trace.about)},
         "episodes": {key: value.tolist() for key, value in trace.episodes.items()},
-        "ways": [
-            [way(int(route)) for route in trace.rows["vehicle_route"][first]]
-            for first in trace.episodes["first"][:-1]
-        ],
+        "ways": {str(route): way(int(route)) for route in np.unique(trace.rows["vehicle_route"])},
         "layout": layout,
         "rows": len(table[0]),
         "data": base64.b64encode(data).decode(),

@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from torchrl.envs import TransformedEnv
 from saferl.envs.intersection import BatchedIntersection, Scenario
 from saferl.envs.intersection.drivers import CautiousDriver, Driver
 from saferl.envs.intersection.true_scene import TrueScene
+from saferl.evaluation.crashes import way
 from saferl.evaluation.play import evaluate
 from saferl.evaluation.trace import Trace, record
 from saferl.report.player import NOTHING, SCALES, packed, page
@@ -63,6 +65,22 @@ def test_numbers_come_back_from_the_page(traces):
         column += size
     assert column == len(table)
     assert json.loads(json.dumps(held)) == held
+    for number in np.unique(trace.rows["vehicle_route"]):
+        assert held["ways"][str(number)] == way(int(number))
+
+
+def test_a_number_that_is_large_is_drawn_as_large(traces):
+    """A dear crash: 16 bits hold it, in coarser steps."""
+    rows = {**traces[0].rows, "cost": traces[0].rows["cost"] * 1000}
+    held = packed(replace(traces[0], rows=rows))
+    table = np.frombuffer(gzip.decompress(base64.b64decode(held["data"])), "<i2")
+    table = table.reshape(-1, held["rows"]).cumsum(1, dtype=np.int16)
+    sizes = [int(np.prod(shape)) for _, shape, _ in held["layout"]]
+    place = [name for name, _, _ in held["layout"]].index("cost")
+    (scale,) = held["layout"][place][2]
+    assert table[sum(sizes[:place])].max() / scale == pytest.approx(
+        np.nanmax(rows["cost"]), rel=1e-3
+    )
 
 
 def test_five_hundred_episodes_stay_small(traces):

@@ -363,7 +363,7 @@ function words() {
   const parts = [`${Math.hypot(at(run, "ego", row, 2), at(run, "ego", row, 3)).toFixed(1)} m/s`];
   if (near >= 0) {
     const who = at(run, "priority", row, near) > 0 ? "goes first" : "comes after the ego";
-    parts.push(`nearest: car ${near} (${run.ways[episode][near]}), ${at(run, "gap", row).toFixed(1)} m away, ${who}`);
+    parts.push(`nearest: car ${near} (${run.ways[at(run, "vehicle_route", row, near)]}), ${at(run, "gap", row).toFixed(1)} m away, ${who}`);
   }
   const looks = Array.from({ length: cars(run) }, (_, k) => [at(run, "attention", row, k), k]).filter(([share]) => share > 0.005);
   if (looks.length) {
