@@ -64,8 +64,9 @@ def check_task(evaluation: Any, task: Task) -> None:
     """Check what the closing test of a training asks of its task.
 
     Raises:
-        ValueError: drivers or pictures that the task has not.
+        ValueError: drivers or pictures that the task has not, or more episodes.
     """
+    task.as_test().check_episodes("evaluation.episodes", evaluation.episodes)
     for name in evaluation.drivers:
         if name not in task.drivers:
             choices = ", ".join(task.drivers) or f"none: task={task.task} has no drivers"

@@ -85,6 +85,10 @@ class GymTask(Task):
         first, count = self.seeds
         return {"seeds": self.test_seeds or (first + count, count)}
 
+    @property
+    def scenarios(self) -> int | None:
+        return None if self.seeds is None else self.seeds[1]
+
     def episodes(self, seed: int, count: int) -> Tensor:
         if self.seeds is None:
             return super().episodes(seed, count)
@@ -269,7 +273,7 @@ class _Cost(gymnasium.Wrapper):
     def __init__(self, env: gymnasium.Env, task: GymTask):
         super().__init__(env)
         self.names: Sequence[str] = task.costs  # pyright: ignore[reportAttributeAccessIssue]
-        self.free = task.cost_key is None
+        self.free = task.cost_key is None and tuple(self.names) == ("cost",)
         self.setting = "task.cost_key" if self.names == (task.cost_key,) else "task.costs"
 
     def _numbers(self, value: Any, count: int) -> list[float]:

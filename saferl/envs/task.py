@@ -101,6 +101,24 @@ class Task:
         }
         return dataclasses.replace(self, **changes)  # pyright: ignore[reportArgumentType]
 
+    @property
+    def scenarios(self) -> int | None:
+        """How many different episodes there are; None: any number."""
+        return None
+
+    def check_episodes(self, name: str, count: int) -> None:
+        """Check how many episodes of a test are asked for, by the setting ``name``.
+
+        Raises:
+            ValueError: fewer than one, or more than there are scenarios: the rest would be the first ones again.
+        """
+        if count < 1:
+            raise ValueError(f"{name} must be >= 1, got {count}.")
+        if self.scenarios is not None and count > self.scenarios:
+            raise ValueError(
+                f"{name} must be <= {self.scenarios}, the scenarios of tests (task.test_seeds), got {count}."
+            )
+
     def episodes(self, seed: int, count: int) -> Tensor:
         """The seeds [count] of a test's episodes.
 

@@ -77,11 +77,10 @@ def evaluate(
     that the number of environments changes nothing but the speed.
 
     Raises:
-        ValueError: fewer than one episode.
+        ValueError: fewer than one episode, or more than there are scenarios: the rest would be the first again.
     """
-    if episodes < 1:
-        raise ValueError(f"episodes must be >= 1, got {episodes}.")
     width, task = env.batch_size[0], cast(Task, env.task)
+    task.check_episodes("episodes", episodes)
     seeds = task.episodes(seed, -(-episodes // width) * width)
     fallbacks = next((part.names for part in env.modules() if isinstance(part, Shield)), ())
     rows: list[dict] = []

@@ -105,15 +105,20 @@ def test_training_takes_its_scenarios_and_tests_take_others():
     env.rollout(40, break_when_any_done=False)
     assert set(Whatever.seeds) == {10, 11, 12}
     for tested, numbers in (
-        (train, [13, 14, 15, 13]),
-        (task(seeds=(10, 3), test_seeds=(7, 2)), [7, 8, 7, 8]),
+        (train, [13, 14, 15]),
+        (task(seeds=(10, 3), test_seeds=(7, 2)), [7, 8]),
     ):
         test = tested.as_test()
         Whatever.seeds.clear()
-        rows = evaluate(
-            lambda td: td.set("action", torch.zeros(2, 2)), GymEnvs(test, 2, 0), 4, seed=9
-        )
-        assert [row["seed"] for row in rows] == numbers == Whatever.seeds[-4:]
+
+        def tried(count: int, test: GymTask = test) -> list[dict]:
+            still = lambda td: td.set("action", torch.zeros(1, 2))  # noqa: E731
+            return evaluate(still, GymEnvs(test, 1, 0), count, seed=9)
+
+        assert [row["seed"] for row in tried(len(numbers))] == numbers
+        assert Whatever.seeds[-len(numbers) :] == numbers
+        with pytest.raises(ValueError, match=f"episodes must be <= {len(numbers)}, the scenarios"):
+            tried(4)
     with pytest.raises(ValueError, match=r"task.seeds must be \[first, count\].*got \[-1, 3\]"):
         task(seeds=(-1, 3))
     with pytest.raises(ValueError, match="task.test_seeds needs task.seeds"):
