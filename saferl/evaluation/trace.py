@@ -80,17 +80,17 @@ class Trace:
     def worst(self) -> Trace:
         """The trace with one risk: of several that which exceeds its limit most in each row, as if all had the least limit, and
         the sum of all costs; of one cost the same trace."""
-        if self.rows["cost"].ndim == 1:
+        if self.rows["cost"].ndim == self.rows["risk"].ndim == 1:
             return self
-        about, rows = dict(self.about), dict(self.rows)
-        limit = np.broadcast_to(
-            0.0 if about["risk_limit"] is None else about["risk_limit"], rows["cost"].shape[1:]
-        )
-        if about["risk_limit"] is not None:
-            about["risk_limit"] = float(limit.min())
-        rows["cost"] = rows["cost"].sum(-1)
-        for end in ("", "_executed"):
+        about, rows, given = dict(self.about), dict(self.rows), self.about["risk_limit"]
+        if rows["cost"].ndim > 1:
+            rows["cost"] = rows["cost"].sum(-1)
+        for end in ("", "_executed"):  # a policy may know of other costs than a test counts
             if rows[f"risk{end}"].ndim > 1:
+                limit = np.broadcast_to(
+                    0.0 if given is None else given, rows[f"risk{end}"].shape[1:]
+                )
+                about["risk_limit"] = None if given is None else float(limit.min())
                 risk = rows[f"risk{end}"] + (limit.min() - limit)
                 which = np.nan_to_num(risk, nan=-np.inf).argmax(-1)[:, None]
                 rows[f"risk{end}"] = np.take_along_axis(risk, which, -1)[:, 0]
@@ -256,7 +256,9 @@ def _decisions(
         if "intervened" in after
         else torch.zeros(len(data), dtype=torch.bool),
         "observed": observed,
-        "cost_share": task.cost.shares(ego, control, others.nan_to_num(0.0), observed),
+        "cost_share": task.cost.shares(
+            ego, control, others.nan_to_num(0.0), data["scene", "within_view"]
+        ),
         "reward": after["reward"].float().squeeze(-1),
         "cost": after["cost"].float().squeeze(-1),
     }

@@ -271,5 +271,14 @@ def test_the_worst_of_several_risks():
     np.testing.assert_allclose(worst.rows["risk"], [0.3, 0.5, np.nan], rtol=1e-6)
     np.testing.assert_allclose(worst.rows["members"][:2], [[0.3, 0.2], [0.5, 0.4]], rtol=1e-6)
     np.testing.assert_allclose(worst.rows["cost"], [3.0, 0.5, np.nan])
-    one = Trace({"risk_limit": 0.1}, {}, {"cost": risk[:, 0]})
+    one = Trace({"risk_limit": 0.1}, {}, {"cost": risk[:, 0], "risk": risk[:, 0]})
     assert one.worst() is one
+    # A policy that knows of two costs where a test counts one, and of one where a test counts two.
+    less = Trace({"risk_limit": [0.1, 0.5]}, {}, {**rows, "cost": rows["cost"][:, 0]}).worst()
+    np.testing.assert_array_equal(less.rows["risk"], worst.rows["risk"])
+    np.testing.assert_array_equal(less.rows["cost"], rows["cost"][:, 0])
+    single = {name: each[..., 0] for name, each in rows.items() if name != "cost"}
+    more = Trace({"risk_limit": 0.1}, {}, {**single, "cost": rows["cost"]}).worst()
+    assert more.about["risk_limit"] == 0.1
+    np.testing.assert_array_equal(more.rows["risk"], risk[:, 0])
+    np.testing.assert_array_equal(more.rows["cost"], worst.rows["cost"])

@@ -11,6 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import Transform
 
+from saferl.envs.intersection.observation import observe
 from saferl.envs.intersection.roads import lanes
 from saferl.envs.intersection.traffic import vehicle_states
 from saferl.envs.intersection.yielding import has_priority
@@ -23,8 +24,8 @@ class TrueScene(Transform):
 
     Writes ``scene``, with ``ego`` [B, 6] (x, y, v_x, v_y, phi, omega), ``vehicles`` [B, N, 6] (the same, NaN while a
     vehicle is not on the road; row k is vehicle k for the whole episode), ``route`` [B, N] int64 (``4 * arm + k``, see
-    :mod:`saferl.envs.intersection.roads`) and ``priority`` [B, N] bool: which vehicles go before the ego by the rules of
-    the road. float32, SI units.
+    :mod:`saferl.envs.intersection.roads`; another one when it enters again), ``priority`` [B, N] bool, which vehicles go before
+    the ego by the rules of the road, and ``within_view`` [B, N] bool, which the cost counts. float32, SI units.
 
     >>> from torchrl.envs import TransformedEnv
     >>> from saferl.envs.intersection import BatchedIntersection, Scenario
@@ -39,6 +40,7 @@ class TrueScene(Transform):
         route = tensordict.get("route").reshape(-1).to(vehicles.s.device)
         lane, own = lanes(vehicles.route, vehicles.s), lanes(route, vehicles.s)
         states, there = vehicle_states(vehicles, lane), vehicles.present.movedim(0, -1)
+        _, _, seen = observe(ego, states, there, route, base.base_env.task.rows)
         first = has_priority(vehicles, lane, own, ego, torch.full_like(ego[:, 0], _LATE))
         scene = TensorDict(
             {
@@ -46,6 +48,7 @@ class TrueScene(Transform):
                 "vehicles": torch.where(there[..., None], states, torch.nan).float(),
                 "route": vehicles.route.movedim(0, -1),
                 "priority": first.movedim(0, -1),
+                "within_view": seen,
             },
             tensordict.batch_size,
         )
@@ -67,6 +70,7 @@ class TrueScene(Transform):
             vehicles=Unbounded(shape=(*shape, count, 6)),
             route=Categorical(16, shape=(*shape, count), dtype=torch.int64),
             priority=Binary(n=count, shape=(*shape, count), dtype=torch.bool),
+            within_view=Binary(n=count, shape=(*shape, count), dtype=torch.bool),
             shape=shape,
         )
         return observation_spec
