@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
 from torchrl.checkpoint import Checkpoint, StateDictCheckpointAdapter
 
 _SEAL = "seal.json"
@@ -52,6 +54,8 @@ class Sealed(StateDictCheckpointAdapter):
             written = json.loads((path / _SEAL).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
             raise Damaged(f"{path.name}/{_SEAL} cannot be read") from error
+        if link := next((each for each in (path, *path.rglob("*")) if each.is_symlink()), None):
+            raise Damaged(f"{path.name}/{link.name} is a link, which no checkpoint has")
         found = digests(path)
         for name in found:
             if not _OURS.fullmatch(name):
@@ -61,7 +65,29 @@ class Sealed(StateDictCheckpointAdapter):
             names = sorted({*found, *written})
             name = next((n for n in names if found.get(n) != written.get(n)), _SEAL)
             raise Damaged(f"{path.name}/{name} is not as it was written")
+        _check_sizes(path / "state")
         return super().load(component, path, **options)
+
+
+def _check_sizes(state: Path) -> None:
+    """That each tensor's file holds as much as the structure says: TensorDict makes one that is shorter longer on disk."""
+    try:
+        structure = json.loads((state / "meta.json").read_text(encoding="utf-8"))
+        tensors = {name: about for name, about in structure.items() if isinstance(about, dict)}
+        sizes = {
+            name: math.prod(about["shape"])
+            * getattr(torch, about["dtype"].removeprefix("torch.")).itemsize
+            for name, about in tensors.items()
+            if "dtype" in about
+        }
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise Damaged(f"{state.parent.name}/state/meta.json cannot be read") from error
+    for name, size in sizes.items():
+        file = state / f"{name}.memmap"
+        if size and not (file.is_file() and file.stat().st_size == size):
+            raise Damaged(
+                f"{state.parent.name}/state/{file.name} does not hold what meta.json says"
+            )
 
 
 def sealed(**components: Any) -> Checkpoint:

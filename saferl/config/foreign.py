@@ -14,7 +14,7 @@ import hydra
 
 #: Classes that a file may name.
 _PARTS = re.compile(
-    r"(?:saferl\.(?:algorithms|modules|objectives|envs|envs\.transforms|envs\.intersection|training\.(?:signals|collectors))"
+    r"(?:saferl\.(?:algorithms|modules|objectives|envs|envs\.transforms|envs\.intersection(?:\.foresight|\.drivers)?|training\.(?:signals|collectors))"
     r"|torchrl\.(?:objectives|modules|record\.loggers)|torch\.nn)\.[A-Z]\w*"
 )
 #: By which a file names a class or a function, its ``path``.
@@ -22,7 +22,7 @@ NAMING = ("hydra.utils.get_class", "hydra.utils.get_method")
 #: What a node may say to Hydra; positional arguments would not be looked at.
 _HYDRAS = ("_target_", "_convert_", "_partial_", "_recursive_")
 #: What folders are called by.
-_FOLDERS = ("algo_name", "task.task")
+_FOLDERS = ("algo_name", "task.task", "projector.name")
 #: Names of packages, parted by commas, whose parts a file may name, too.
 TRUST = "SAFERL_TRUST"
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -10,8 +12,13 @@ import pytest
 from omegaconf import OmegaConf
 from small import SMALL, compose
 
+import saferl
 from saferl.algorithms.assemble import build_trainer
 from saferl.checkpoint.run import CONFIG, run_config
+from saferl.checkpoint.sealed import digests
+from saferl.config.foreign import check_origin
+
+ROOT = Path(saferl.__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +59,7 @@ EVIL = [
     ("algo_name", "../../x"),
     ("algo_name", ".."),
     ("task.task", "."),
+    ("projector.name", "x/../../escaped"),
     ("task.task", "../x"),
     ("logger.sinks", [{"_target_": "os.system", "command": "x"}]),
     ("logger.sinks", [{"_target_": "torchrl.record.loggers.CSVLogger", "exp_name": "../../x"}]),
@@ -151,3 +159,47 @@ def test_a_part_of_another_kind_is_told(option: str, theirs: Path, tmp_path: Pat
     options = () if option != "init" else (*SMALL, "algo=rsac", "task=cart", "risk_limit=1")
     line = refusal(*command, *options, f"{option}=run")
     assert line.startswith("error: encoder._target_ must name a kind of Encoder, got ")
+
+
+def test_whatever_a_run_may_be_made_of_may_stand_in_its_file():
+    """Each class that our own configurations name, as a run that cannot be taken up again would be lost."""
+    found = {}
+    for path in (ROOT / "conf").glob("*/*.yaml"):
+        if path.parent.name not in ("hydra", "experiment"):
+            named = re.findall(
+                r"(?:_target_|path): (\w+\.[\w.]+)", path.read_text(encoding="utf-8")
+            )
+            found |= dict.fromkeys(named, path)
+    assert len(found) > 40
+    for target, path in found.items():
+        check_origin({"part": {"_target_": target}}, path)
+
+
+def test_a_checkpoint_makes_no_file_longer(theirs: Path, tmp_path: Path):
+    """Whose structure says more than a tensor's file holds, with a seal of its own, or whose file lies elsewhere."""
+    shutil.copytree(theirs, tmp_path / "run")
+    (state,) = tmp_path.glob("run/checkpoints/*/components/*-loss/state")
+    name, about = next(
+        (k, v)
+        for k, v in json.loads((state / "meta.json").read_text()).items()
+        if k.startswith("tensor")
+    )
+    file = state / f"{name}.memmap"
+    precious = tmp_path / "precious"
+    precious.write_bytes(file.read_bytes())
+    meta = json.loads((state / "meta.json").read_text())
+    meta[name] = {**about, "shape": [5000]}
+    (state / "meta.json").write_text(json.dumps(meta))
+
+    def refused(reason: str) -> None:
+        (state.parent / "seal.json").write_text(json.dumps(digests(state.parent)))
+        with pytest.raises(ValueError, match=reason):
+            saferl.load_policy(tmp_path / "run")
+
+    before = file.read_bytes()
+    refused("does not hold what meta.json says")
+    assert file.read_bytes() == before
+    file.unlink()
+    file.symlink_to(precious)
+    refused("is a link")
+    assert precious.read_bytes() == before
