@@ -31,7 +31,10 @@ def is_there(out: Path, test: Mapping[str, Any] | None) -> bool:
         ValueError: it holds another one.
     """
     file = out / ASKED
-    before = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    try:
+        before = json.loads(file.read_text(encoding="utf-8"))
+    except (FileNotFoundError, ValueError):  # or cut off, which says nothing
+        before = {}
     same = test is not None and before.get("test") == test
     if (out / "metrics.json").exists() and not same:
         raise ValueError(f"out: {out} holds a test already; take another folder.")

@@ -155,6 +155,8 @@ class Search:
             log.info("Trial %d is cut short: half of the others were better by then.", trial.number)
             self.study.tell(trial, state=TrialState.PRUNED)
             return
+        except OSError:  # a full disk is no fault of the trial, which goes on with the same command
+            raise
         except MISTAKES as error:  # it diverged, perhaps; the others go on
             log.info("Trial %d failed: %s", trial.number, explain(error))
             trial.set_user_attr("error", explain(error))

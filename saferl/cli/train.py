@@ -65,7 +65,7 @@ def train_into(
     OmegaConf.resolve(cfg)
     resuming = False
     if repeated and (run / CONFIG).exists():
-        if begun(run):  # a sweep that is run again
+        if begun(run) or (run / TESTED).exists():  # a sweep that is run again
             resuming = composed(run_config(run)) == composed(cfg)
         else:  # killed before its first checkpoint, if nobody works on it
             with alone(run, "out"):
@@ -212,12 +212,16 @@ def claim(run: Path, cfg: DictConfig) -> None:
     """
     run.mkdir(parents=True, exist_ok=True)
     try:
-        if begun(run):
+        if begun(run) or any(run.glob("policy.*")):
             raise FileExistsError
         with (run / CONFIG).open("x") as file:
             OmegaConf.save(cfg, file)
     except FileExistsError:
         way = f"continue it with resume={run}, or take another folder."
-        if not begun(run):
+        if (run / TESTED).exists() and not begun(run):
+            way = "its checkpoints are gone; take another folder."
+        elif any(run.glob("policy.*")):
+            raise ValueError(f"out: {run} holds a policy; take another folder.") from None
+        elif not begun(run):
             way = "it has just begun, or was killed before its first checkpoint and can be deleted."
         raise ValueError(f"out: {run} holds a run already; {way}") from None

@@ -11,7 +11,7 @@ from typing import Any
 from omegaconf import DictConfig
 
 from saferl.checkpoint.policy import EXPORTED
-from saferl.checkpoint.run import progress, run_config
+from saferl.checkpoint.run import latest, progress, run_config
 from saferl.evaluation.statistics import FIGURES, each_cost, short, span
 
 CARD = "README.md"
@@ -75,7 +75,11 @@ def card(
             "Not without its projector: `python -m saferl.evaluate checkpoint=... project=false`."
         )
         text += [*_trained(source, cfg), "## Tested", "", note, "", _CAUTION]
-    elif told.is_file() and (found := told.read_text(encoding="utf-8").find("## Trained")) >= 0:
+    elif (
+        latest(source).is_file()
+        and told.is_file()
+        and (found := told.read_text(encoding="utf-8").find("## Trained")) >= 0
+    ):
         text += [told.read_text(encoding="utf-8")[found:].split("\n## Checksum")[0].rstrip(), ""]
     else:
         text += [*_trained(source, cfg), *_tested(source), _CAUTION]

@@ -95,7 +95,7 @@ def write(rows: list[dict], out: Path, /, **about: Any) -> dict:
         writer.writeheader()
         writer.writerows(rows)
     figures = summarise(rows)
-    (out / "metrics.json").write_text(
-        json.dumps({**figures, **about}, indent=2, allow_nan=False) + "\n"
-    )
+    part = out / ".metrics.part"  # whole or not at all: it says that a test is over
+    part.write_text(json.dumps({**figures, **about}, indent=2, allow_nan=False) + "\n")
+    part.replace(out / "metrics.json")
     return figures

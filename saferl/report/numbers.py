@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from omegaconf import OmegaConf
 
-from saferl.checkpoint.run import CONFIG, run_config
+from saferl.checkpoint.run import CONFIG, begun, run_config
 from saferl.config.flat import MADE
 from saferl.evaluation.compare import TESTED
 from saferl.evaluation.rows import read
@@ -30,6 +30,7 @@ def publish(runs: Sequence[Run], out: Path) -> list[Path]:
 
     Raises:
         OSError: a file cannot be written.
+        ValueError: a folder holds another run, or published numbers of other settings.
     """
     made = []
     for run in runs:
@@ -38,9 +39,15 @@ def publish(runs: Sequence[Run], out: Path) -> list[Path]:
         folder = out / run.algo / f"seed{run.seed}"
         if folder.resolve() == run.folder.resolve():
             continue
-        (folder / TESTED).parent.mkdir(parents=True, exist_ok=True)
         made_by_whom = dict.fromkeys(MADE)  # where it lay tells nothing
-        OmegaConf.save(OmegaConf.merge(run_config(run.folder), made_by_whom), folder / CONFIG)
+        config = OmegaConf.to_yaml(OmegaConf.merge(run_config(run.folder), made_by_whom))
+        held = folder / CONFIG
+        if begun(folder) or (held.exists() and held.read_text(encoding="utf-8") != config):
+            raise ValueError(
+                f"--numbers: {folder} holds another run; take another folder, or remove it."
+            )
+        (folder / TESTED).parent.mkdir(parents=True, exist_ok=True)
+        held.write_text(config, encoding="utf-8")
         told = json.loads((run.folder / TESTED).read_text(encoding="utf-8"))
         (folder / TESTED).write_text(json.dumps(told, indent=2) + "\n", encoding="utf-8")
         columns = ("route", *(figure.removesuffix("_rate") for figure in FIGURES))

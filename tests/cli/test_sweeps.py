@@ -188,6 +188,14 @@ def test_a_sweep_knows_its_jobs_again(command, tmp_path: Path, capsys):
     out = capsys.readouterr().out
     assert "seed-1 is there already" in out and "seed-0 is there already" not in out
     assert (tmp_path / "many/seed-0/evaluation/metrics.json").is_file()
+    shutil.rmtree(tmp_path / "many/seed-1/checkpoints")  # to save room
+    whole = (tmp_path / "many/seed-1/config.yaml").read_text()
+    capsys.readouterr()
+    command(*many, "out=many")
+    assert "seed-1 is there already" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        command(*many, "out=many", "learning.tau=0.03")
+    assert (tmp_path / "many/seed-1/config.yaml").read_text() == whole
     command(*TRAIN, *SMALL, "task=cart", "algo=sac", "frames=8", "seed=5", "-m", "out=many")
     assert (tmp_path / "many/0/metrics.csv").is_file() and not (
         tmp_path / "many/metrics.csv"

@@ -116,6 +116,7 @@ def test_the_command(command, refusal, tmp_path: Path, small: Path):
     text = (tmp_path / "alone/README.md").read_text()
     assert "# alone" in text and "## Tested" in text and text.count("## Checksum") == 1
     assert "Not without its projector" in text and "98.3" not in text
+    assert "alone holds a policy; take another" in refusal("train", "config", "out=alone")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/README.md").write_text("precious")
     assert "out: mine holds a README.md" in refusal(*export, "pretrained=arsac", "out=mine")

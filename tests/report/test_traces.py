@@ -59,6 +59,8 @@ def test_each_system_plays_the_same_episodes_again(command, tmp_path: Path, caps
     assert "SAC plays 3 episodes again." in capsys.readouterr().out
     main(["paper", "--numbers", "published"])
     capsys.readouterr()
+    with pytest.raises(SystemExit, match="--numbers: paper/sac/seed0 holds another run"):
+        main(["published", "--numbers", "paper"])
     main(["published", "--out", "second", "--play", "3"])  # without checkpoints
     assert "Nothing is played: no finished run has its checkpoint" in capsys.readouterr().out
     assert (tmp_path / "second/report.html").is_file()
